@@ -1,0 +1,75 @@
+# The one task runner; CI calls it too.
+#   make setup       the environment: apt packages where they are missing, .venv with everything
+#   make demo        a simulated flight into the real daemon, processed to a cloud with pictures
+#   make test        all tests but the long ones
+#   make check       format, lint, types, import contracts, then the tests
+#   make soak        the long tests: hour-long logs, many seeds
+#   make bench-NAME  one benchmark of benchmarks/; its last line is one JSON object
+#   make bench       all of them, into docs/benchmarks.md
+#   make clean       everything made, the environment included
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+PYTEST := $(BIN)/pytest
+# A file of tests stays on one worker, so that what its fixtures made is made once.
+PARALLEL := -n auto --dist loadfile
+
+.PHONY: setup demo test check soak bench clean
+
+setup: $(VENV)/.installed
+
+$(VENV)/.apt: apt-packages.txt
+	@mkdir -p $(VENV)
+	@missing=(); for package in $$(cat $<); do \
+	  dpkg-query -W -f '$${Status}' "$$package" 2>/dev/null | grep -q 'ok installed' || missing+=("$$package"); \
+	done; \
+	if [ $${#missing[@]} -gt 0 ]; then \
+	  echo "installing apt packages: $${missing[*]}"; \
+	  if [ "$$(id -u)" = 0 ]; then sudo=(); else sudo=(sudo); fi; \
+	  "$${sudo[@]}" apt-get update -q; \
+	  "$${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends "$${missing[@]}"; \
+	fi
+	@touch $@
+
+# Debian's own Python 3.11 where there is one, else the newest that will do.
+$(VENV)/.python: $(VENV)/.apt
+	@for python in /usr/bin/python3.11 python3.14 python3.13 python3.12 python3.11 python3; do \
+	  if "$$python" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	    [ -x $(BIN)/python ] || "$$python" -m venv $(VENV); \
+	    touch $@; exit 0; \
+	  fi; \
+	done; echo "no Python of 3.11 or newer with venv was found" >&2; exit 1
+
+$(VENV)/.installed: $(VENV)/.python pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: setup
+	@$(BIN)/python examples/demo.py
+
+test: setup
+	$(PYTEST) -m "not soak" $(PARALLEL)
+
+check: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(MAKE) --no-print-directory test
+
+soak: setup
+	$(PYTEST) -m soak
+
+bench-%: setup
+	@$(BIN)/python benchmarks/$*.py
+
+bench: setup
+	@$(BIN)/python benchmarks/all.py
+
+clean:
+	rm -rf $(VENV) build dist demo *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
