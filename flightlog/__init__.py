@@ -1,0 +1,44 @@
+"""What is in a flight log and what it means: the contract between aircraft, ground and simulator.
+
+Conventions, once for the whole project
+---------------------------------------
+Frames
+    sensor  the lidar's own: x right (cable side), y forward (azimuth 0), z up along the spin axis
+    ins     body of the autopilot board that measures: x right, y forward, z up; origin at its IMU
+    local   level: x east, y north, z up, tangent plane at a stated origin ("enu")
+    FRD and NED are MAVLink's; they are turned into the above at the door (`frames`).
+Rotations
+    Row vectors as in the source of the geometry: p_b = p_a @ rot. `rotation(yaw, pitch, roll)` in `frames` is its R(g, a, b).
+    mat_ab is a column-form matrix "a from b", p_a = mat_ab @ p_b; quat_ab_wxyz the same as a unit quaternion, scalar first.
+    Heading is clockwise from true north; yaw counter-clockwise seen from above. Pitch: nose up +. Roll: right wing down +.
+Units
+    SI and radians inside; degrees in configuration, on the wire and in reports; the unit stands in the name (range_m, heading_deg).
+Time
+    int nanoseconds of a named scale, always. The scales:
+    log      receive time in the log: the host's wall clock at the start, carried on by its monotonic clock; never steps
+    lidar    the lidar's own clock, microseconds past the hour, unwrapped and put on an hour
+    boot     the autopilot's time since boot, unwrapped, one scale for each boot
+    utc      Unix time (leap seconds not counted); gps: seconds since 1980-01-06 (leap seconds counted)
+    Raw stamps are kept for ever; a corrected time is a new field.
+Loss
+    Every dropped packet, byte, message or point adds to a named counter that reaches log, health and report.
+
+Map
+---
+errors, constants, config     the tree of errors; constants with source; YAML to frozen dataclasses
+clock, nmea                   time scales and how stamps unwrap; GPRMC
+frames, mount                 rotations; where lidar and antennas sit on the airframe
+hdl32e, mavlink, dataflash    the sensors' wire formats
+records, logfile              THE table of topics and their bytes; writer and reader of the log
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from flightlog.records import FORMAT_VERSION
+
+try:
+    __version__ = version("swath")
+except PackageNotFoundError:  # a source tree that is not installed
+    __version__ = "0+unknown"
+
+__all__ = ["FORMAT_VERSION", "__version__"]

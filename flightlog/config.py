@@ -1,0 +1,179 @@
+"""YAML to frozen dataclasses and back: unknown keys, wrong types and values out of range are named errors.
+
+There is one list of options, the dataclass; the commented sample file is made from it.
+"""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from flightlog.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def option(
+    default: Any,
+    about: str,
+    *,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Sequence[Any] | None = None,
+) -> Any:
+    """Declare a field of a configuration dataclass.
+
+    Parameters
+    ----------
+    default : object
+        Its value when the file does not say; a dataclass type makes a nested section with that section's own defaults.
+    about : str
+        One line for the sample file: meaning and unit.
+    minimum, maximum : float, optional
+        Inclusive bounds of a number, or of each number of a list.
+    choices : sequence, optional
+        The only values allowed.
+    """
+    metadata = {"about": about, "minimum": minimum, "maximum": maximum, "choices": choices}
+    if isinstance(default, (type, list, dict)):
+        factory = default if isinstance(default, type) else lambda: default
+        return dataclasses.field(default_factory=factory, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def load(path: str | Path, cls: type[T]) -> T:
+    """Read a YAML file into a frozen dataclass.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, is no YAML mapping, or holds an unknown key, a wrong type or a value out of range.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not a text file") from None
+    return loads(text, cls, str(path))
+
+
+def loads(text: str, cls: type[T], place: str) -> T:
+    """Read YAML text; `place` names it in errors. See `load`."""
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{place}: is not valid YAML ({reason})") from None
+    return from_mapping({} if tree is None else tree, cls, place)
+
+
+def from_mapping(tree: Any, cls: type[T], place: str) -> T:
+    """Build a dataclass from a parsed tree; `place` is the path so far. See `load`."""
+    if not isinstance(tree, Mapping):
+        raise ConfigError(f"{place}: {tree!r} found, expected keys and values")
+    assert dataclasses.is_dataclass(cls)
+    known = {field.name: field for field in dataclasses.fields(cls)}
+    hints = typing.get_type_hints(cls)
+    for key in tree:
+        if key not in known:
+            raise ConfigError(f"{place}: unknown key {key!r}; known are {', '.join(known)}")
+    values = {}
+    for name, field in known.items():
+        if name in tree:
+            values[name] = _convert(tree[name], hints[name], field.metadata, f"{place}: {name}")
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{place}: {name} is missing")
+    try:
+        return typing.cast(T, cls(**values))
+    except ValueError as error:  # what a __post_init__ finds between several keys
+        raise ConfigError(f"{place}: {error}") from None
+
+
+def _convert(value: Any, hint: Any, rules: Mapping[str, Any], place: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in typing.get_args(hint):
+            return None
+        hint = next(arm for arm in typing.get_args(hint) if arm is not type(None))
+        return _convert(value, hint, rules, place)
+    if dataclasses.is_dataclass(hint):
+        return from_mapping(value, typing.cast(type, hint), place)
+    if origin is tuple:
+        return _convert_tuple(value, typing.get_args(hint), rules, place)
+    return _check(_scalar(value, hint, place), rules, place)
+
+
+def _convert_tuple(value: Any, arms: tuple[Any, ...], rules: Mapping[str, Any], place: str) -> Any:
+    if not isinstance(value, list):
+        raise ConfigError(f"{place}: {value!r} found, expected a list")
+    if len(arms) == 2 and arms[1] is Ellipsis:
+        arms = (arms[0],) * len(value)
+    if len(value) != len(arms):
+        raise ConfigError(f"{place}: {len(value)} values found, expected {len(arms)}")
+    return tuple(
+        _convert(item, arm, rules, f"{place}[{i}]") for i, (item, arm) in enumerate(zip(value, arms, strict=True))
+    )
+
+
+def _scalar(value: Any, hint: Any, place: str) -> Any:
+    names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not math.isfinite(value):
+            raise ConfigError(f"{place}: {value!r} found, expected a finite number")
+        return float(value)
+    if hint is Any or (isinstance(value, hint) and isinstance(value, bool) == (hint is bool)):
+        return value
+    raise ConfigError(f"{place}: {value!r} found, expected {names.get(hint, hint.__name__)}")
+
+
+def _check(value: Any, rules: Mapping[str, Any], place: str) -> Any:
+    low, high, choices = rules.get("minimum"), rules.get("maximum"), rules.get("choices")
+    if choices is not None and value not in choices:
+        raise ConfigError(f"{place}: {value!r} found, expected one of {', '.join(map(str, choices))}")
+    if (low is not None and value < low) or (high is not None and value > high):
+        bounds = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
+        raise ConfigError(f"{place}: {value} found, expected {bounds}")
+    return value
+
+
+def to_mapping(config: Any) -> Any:
+    """The plain tree of a configuration, as YAML or JSON hold it."""
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        return {field.name: to_mapping(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    if isinstance(config, (tuple, list)):
+        return [to_mapping(item) for item in config]
+    return config
+
+
+def dump(config: Any) -> str:
+    """The YAML text of a configuration; `loads` turns it back into an equal one."""
+    return yaml.safe_dump(to_mapping(config), sort_keys=False, allow_unicode=True)
+
+
+def sample(cls: type[Any]) -> str:
+    """A commented YAML file with every option at its default."""
+    return "\n".join(_sample_lines(cls(), 0)) + "\n"
+
+
+def _sample_lines(config: Any, depth: int) -> list[str]:
+    lines: list[str] = []
+    indent = "  " * depth
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        choices = field.metadata.get("choices")
+        about = field.metadata.get("about", "") + (f" ({' | '.join(map(str, choices))})" if choices else "")
+        if about:
+            lines.append(f"{indent}# {about}")
+        if dataclasses.is_dataclass(value):
+            lines += [f"{indent}{field.name}:", *_sample_lines(value, depth + 1)]
+        else:
+            tree = to_mapping(value)
+            text = yaml.safe_dump(tree, default_flow_style=True, allow_unicode=True, width=1000)
+            lines.append(f"{indent}{field.name}: {text.removesuffix(chr(10)).removesuffix('...').strip()}")
+    return lines

@@ -1,0 +1,19 @@
+"""Physical and geodetic constants, each with unit and source."""
+
+from typing import Final
+
+STANDARD_GRAVITY_M_S2: Final = 9.80665
+"""Standard acceleration of gravity [m/s^2]; CGPM 1901. Lidar and autopilot accelerometers count in it."""
+
+WGS84_A_M: Final = 6_378_137.0
+"""Semi-major axis of the WGS 84 ellipsoid [m]; NIMA TR8350.2."""
+
+WGS84_F: Final = 1.0 / 298.257223563
+"""Flattening of the WGS 84 ellipsoid; NIMA TR8350.2."""
+
+WGS84_E2: Final = WGS84_F * (2.0 - WGS84_F)
+"""First eccentricity squared of the WGS 84 ellipsoid."""
+
+NS_PER_S: Final = 1_000_000_000
+NS_PER_MS: Final = 1_000_000
+NS_PER_US: Final = 1_000
