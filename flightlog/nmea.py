@@ -1,9 +1,16 @@
 """NMEA 0183 sentences as the lidar passes them on: GPRMC and its kin (GNRMC). Pure."""
 
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import Final
 
 from flightlog.constants import NS_PER_S
+
+_CLOCK: Final = re.compile(r"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9]|60)(\.[0-9]{1,9})?", re.ASCII)
+_DATE: Final = re.compile(r"([0-9]{2})([0-9]{2})([0-9]{2})", re.ASCII)
+_TOP_YEAR: Final = 80
+"""Two-digit years from here on are of the 1900s: GPS began in 1980."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +52,15 @@ def parse_rmc(text: str | bytes) -> Rmc | None:
 
 
 def _parse_fields(words: list[str]) -> Rmc:
-    clock, date = words[1], words[9]
-    year = 2000 + int(date[4:6]) if int(date[4:6]) < 80 else 1900 + int(date[4:6])
-    midnight = datetime(year, int(date[2:4]), int(date[:2]), tzinfo=UTC)
-    fraction = clock[6:].ljust(1, "0") if len(clock) > 6 else ".0"
+    clock, date = _CLOCK.fullmatch(words[1]), _DATE.fullmatch(words[9])
+    if clock is None or date is None:  # a sentence that was cut may still look like one: "1112" of "111212"
+        raise ValueError
+    day, month, year = map(int, date.groups())
+    midnight = datetime((1900 if year >= _TOP_YEAR else 2000) + year, month, day, tzinfo=UTC)
     # timedelta, not replace(): a leap second is written as second 60
-    whole = midnight + timedelta(hours=int(clock[:2]), minutes=int(clock[2:4]), seconds=int(clock[4:6]))
-    utc_ns = round(whole.timestamp()) * NS_PER_S + round(float("0" + fraction) * NS_PER_S)
+    whole = midnight + timedelta(hours=int(clock[1]), minutes=int(clock[2]), seconds=int(clock[3]))
+    fraction_ns = int((clock[4] or ".")[1:].ljust(9, "0"))
+    utc_ns = round(whole.timestamp()) * NS_PER_S + fraction_ns
     return Rmc(
         utc_ns=utc_ns,
         valid=words[2] == "A",
@@ -68,13 +77,18 @@ def _angle(text: str, degree_digits: int) -> float:
 
 
 def format_rmc(utc_ns: int, latitude_deg: float, longitude_deg: float, *, valid: bool = True) -> str:
-    """Write a GPRMC sentence with checksum and line end, as a receiver does."""
+    """Write a GPRMC sentence with checksum and line end, as a receiver does; fractions of a second are cut off."""
     moment = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC)
-    latitude, north = abs(latitude_deg), "N" if latitude_deg >= 0 else "S"
-    longitude, east = abs(longitude_deg), "E" if longitude_deg >= 0 else "W"
+    north, east = "N" if latitude_deg >= 0 else "S", "E" if longitude_deg >= 0 else "W"
     body = (
         f"GPRMC,{moment:%H%M%S},{'A' if valid else 'V'},"
-        f"{int(latitude):02d}{latitude % 1 * 60:07.4f},{north},{int(longitude):03d}{longitude % 1 * 60:07.4f},{east},"
+        f"{_degrees_minutes(latitude_deg, 2)},{north},{_degrees_minutes(longitude_deg, 3)},{east},"
         f"000.0,000.0,{moment:%d%m%y},000.0,E"
     )
     return f"${body}*{checksum(body):02X}\r\n"
+
+
+def _degrees_minutes(angle_deg: float, degree_digits: int) -> str:
+    """Ddmm.mmmm of an angle; rounded before it is split, so that no minutes read 60."""
+    degrees, minutes = divmod(round(abs(angle_deg) * 600_000), 600_000)
+    return f"{degrees:0{degree_digits}d}{minutes / 10_000:07.4f}"
