@@ -1,0 +1,20 @@
+"""Aboard: UDP and MAVLink in, flight log out. The daemon is `swathd`.
+
+Map
+---
+config       what the operator may set
+fovmask      which packets and blocks lie outside the field of view (pure)
+timesync     log time from the host's clocks; kernel receive times through a step of the wall clock (pure)
+health       the status of everything, and the verdict on it (pure)
+datagrams    many datagrams of a socket in one system call, with the kernel's receive times and drop counts
+lidar        the HDL-32E's two ports -> batches
+autopilot    MAVLink links, serial or UDP -> raw chunks; asks for the streams
+recorder     bounded backlog -> segments of the flight log, synced to the disk twice a second
+worker       a thread whose progress is watched
+notify       word to systemd
+daemon       start, run, stop
+cli          the command line
+
+How it runs: one thread polls the lidar's sockets, one each MAVLink link, one writes, and the main thread keeps the clocks, the
+status and the watchdog. Receivers never wait for the writer: what its backlog cannot take is dropped and counted.
+"""

@@ -1,0 +1,395 @@
+"""MAVLink links, serial or UDP: bytes into the log exactly as received; listened to only to know that the autopilot lives.
+
+The link may come and go: it is opened again and again, and the rest of the daemon does not notice.
+"""
+
+import logging
+import os
+import select
+import socket
+from abc import ABC, abstractmethod
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import serial
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from flightlog import records
+from flightlog.constants import NS_PER_MS, NS_PER_S
+from flightlog.errors import SourceError
+from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser, decode
+from onboard.config import LinkConfig, StreamsConfig
+from onboard.datagrams import Receiver, open_udp
+from onboard.lidar import Put
+from onboard.timesync import Clocks, KernelTime, LogTime, read_clocks
+from onboard.worker import Worker
+
+_log = logging.getLogger(__name__)
+
+BATCH_NS: Final = 100 * NS_PER_MS
+"""A message of the log spans about this much."""
+_WAIT_S: Final = 0.1
+_SERIAL_PAUSE_S: Final = 0.005
+"""Between two reads: bounds the wake-ups, and how much later than its last byte a frame may be stamped."""
+_UDP_PAUSE_S: Final = 0.02
+_RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)
+_READ_BYTES: Final = 65536
+_UDP_BUFFER_BYTES: Final = 1 << 20
+_UDP_SLOTS: Final = 32
+_DATAGRAM_BYTES: Final = 65536
+"""The largest there is, so that none is cut."""
+
+COMPONENT: Final = 191
+"""MAV_COMP_ID_ONBOARD_COMPUTER, who we are on the link."""
+_CHECK_NS: Final = 10 * NS_PER_S
+_LOW: Final = 0.4
+"""Share of the rate asked for below which it is asked for again. ArduCopter 3.1.3 gives half of 50 Hz and is content with it."""
+
+_STREAMS: Final = (
+    ("raw_sensors_hz", dialect.MAV_DATA_STREAM_RAW_SENSORS, dialect.MAVLINK_MSG_ID_RAW_IMU),
+    ("extended_status_hz", dialect.MAV_DATA_STREAM_EXTENDED_STATUS, dialect.MAVLINK_MSG_ID_GPS_RAW_INT),
+    ("position_hz", dialect.MAV_DATA_STREAM_POSITION, dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
+    ("extra1_hz", dialect.MAV_DATA_STREAM_EXTRA1, dialect.MAVLINK_MSG_ID_ATTITUDE),
+    ("extra2_hz", dialect.MAV_DATA_STREAM_EXTRA2, dialect.MAVLINK_MSG_ID_VFR_HUD),
+    ("extra3_hz", dialect.MAV_DATA_STREAM_EXTRA3, dialect.MAVLINK_MSG_ID_SYSTEM_TIME),
+)
+"""Option, stream, and the message by which its rate is judged."""
+
+Chunk = tuple[int, bytes]
+
+
+class Source(ABC):
+    """Where a link's bytes come from, and go to."""
+
+    pause_s: float
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """What to wait on."""
+
+    @abstractmethod
+    def read(self) -> list[Chunk]:
+        """What has arrived, with receive times [ns of log time]; OSError when the device is gone."""
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """Send if that is possible without waiting."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the device."""
+
+
+class SerialSource(Source):
+    """A serial device; one chunk is what one read gave.
+
+    Raises
+    ------
+    SourceError
+        It is not there, or is in use.
+    """
+
+    pause_s = _SERIAL_PAUSE_S
+
+    def __init__(self, device: str, baud: int, log_time: LogTime) -> None:
+        self._log_time = log_time
+        try:
+            self._port = serial.Serial(device, baud, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:
+            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+            raise SourceError(f"serial device {device} cannot be opened: {reason}") from None
+        os.set_blocking(self._port.fileno(), False)
+
+    def fileno(self) -> int:
+        """Descriptor of the device."""
+        return int(self._port.fileno())
+
+    def read(self) -> list[Chunk]:
+        """One chunk, or none."""
+        try:
+            data = os.read(self.fileno(), _READ_BYTES)
+        except BlockingIOError:
+            return []
+        if not data:
+            raise OSError("the device was unplugged")
+        return [(self._log_time.at(read_clocks()), data)]
+
+    def write(self, data: bytes) -> None:
+        """Send; what a full output buffer does not take is lost, as it would be on the air."""
+        with suppress(BlockingIOError):
+            os.write(self.fileno(), data)
+
+    def close(self) -> None:
+        """Close the device."""
+        with suppress(OSError):
+            self._port.close()
+
+
+class UdpSource(Source):
+    """A UDP port; one chunk is one datagram, stamped by the kernel. Answers go to the last sender.
+
+    Raises
+    ------
+    SourceError
+        The port is taken.
+    """
+
+    pause_s = _UDP_PAUSE_S
+
+    def __init__(self, address: str, port: int, log_time: LogTime) -> None:
+        self._socket = open_udp(address, port, _UDP_BUFFER_BYTES)
+        slots = np.zeros(_UDP_SLOTS, np.dtype((np.void, _DATAGRAM_BYTES)))
+        self._bytes = slots.view(np.uint8).reshape(_UDP_SLOTS, _DATAGRAM_BYTES)
+        self._receiver = Receiver(self._socket, slots, 0, _DATAGRAM_BYTES)
+        self._kernel_time = KernelTime(log_time, read_clocks())
+        self._peer: tuple[str, int] | None = None
+
+    @property
+    def drops(self) -> int:
+        """Datagrams the kernel dropped."""
+        return self._receiver.drops
+
+    def fileno(self) -> int:
+        """Descriptor of the socket."""
+        return self._socket.fileno()
+
+    def read(self) -> list[Chunk]:
+        """One chunk for each datagram."""
+        chunks: list[Chunk] = []
+        self._learn_peer()
+        count = _UDP_SLOTS
+        while count == _UDP_SLOTS:
+            count = self._receiver.receive()
+            now: Clocks = read_clocks()
+            stamps_ns = self._receiver.stamps_ns[:count]
+            stamps_ns[stamps_ns == 0] = now.realtime_ns
+            times_ns = self._kernel_time.convert(stamps_ns, now).tolist()
+            sizes = self._receiver.sizes[:count].tolist()
+            chunks += [
+                (time_ns, self._bytes[i, :size].tobytes())
+                for i, (time_ns, size) in enumerate(zip(times_ns, sizes, strict=True))
+            ]
+        return chunks
+
+    def _learn_peer(self) -> None:
+        with suppress(OSError):
+            self._peer = self._socket.recvfrom(1, socket.MSG_PEEK)[1]
+
+    def write(self, data: bytes) -> None:
+        """Send to whoever was heard last."""
+        if self._peer is not None:
+            with suppress(OSError):
+                self._socket.sendto(data, self._peer)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def open_source(config: LinkConfig, log_time: LogTime) -> Source:
+    """Open what a link's configuration names; SourceError if that is not possible."""
+    if config.serial:
+        assert config.device is not None
+        return SerialSource(config.device, config.baud, log_time)
+    return UdpSource(*config.udp_address(), log_time)
+
+
+@dataclass(slots=True)
+class LinkCounts:
+    """What came over a link since the start."""
+
+    connected: bool = False
+    trouble: str = ""
+    """Why it is not connected."""
+    opened: int = 0
+    received_bytes: int = 0
+    queue_dropped_bytes: int = 0
+    kernel_drops: int = 0
+    frames: int = 0
+    bad_bytes: int = 0
+    unknown_frames: int = 0
+    messages: Counter[int] = field(default_factory=Counter)
+    """Verified frames of the autopilot, by message id."""
+    autopilot: tuple[int, int] | None = None
+    """System and component of the first heartbeat of an autopilot."""
+    version: int = 1
+    """Of MAVLink, as the autopilot speaks it."""
+    heartbeats: int = 0
+    armed: bool | None = None
+    newest_ns: int = 0
+    """Log time of the autopilot's newest verified frame [ns]."""
+
+
+class Link(Worker):
+    """Reads one MAVLink link into the log.
+
+    Parameters
+    ----------
+    name : str
+        `ins` or `fc`; its topic is /mavlink/<name>.
+    config : LinkConfig
+    log_time : LogTime
+    put : callable
+        The recorder's.
+    """
+
+    def __init__(self, name: str, config: LinkConfig, log_time: LogTime, put: Put) -> None:
+        super().__init__(name)
+        self.counts = LinkCounts()
+        self._config, self._log_time, self._put = config, log_time, put
+        self._topic = records.MAVLINK.topic + name
+        self._chunks: list[Chunk] = []
+        self._parser = FrameParser()
+        self._requester = Requester(config.streams)
+
+    def work(self) -> None:
+        """Open, read, open again, until asked to stop."""
+        tries = 0
+        while not self.stopping:
+            try:
+                source = open_source(self._config, self._log_time)
+            except SourceError as error:
+                self._tell_trouble(str(error))
+                self._wait(_RETRY_S[min(tries, len(_RETRY_S) - 1)])
+                tries += 1
+                continue
+            tries = 0
+            self._tell_connected()
+            try:
+                self._read(source)
+            except OSError as error:
+                self._tell_trouble(f"{self._config.device}: {error.strerror or error}")
+                self._wait(_RETRY_S[0])
+            finally:
+                self._hand_over()
+                self.counts.connected = False
+                source.close()
+
+    def _wait(self, seconds: float) -> None:
+        """Wait between two attempts without looking dead."""
+        for _ in range(round(seconds / _WAIT_S)):
+            self.progress()
+            self.pause(_WAIT_S)
+
+    def _read(self, source: Source) -> None:
+        poll = select.poll()
+        poll.register(source.fileno(), select.POLLIN)
+        while not self.stopping:
+            if poll.poll(_WAIT_S * 1000):
+                self._chunks += source.read()
+            now_ns = self._log_time.at(read_clocks())
+            if self._chunks and now_ns - self._chunks[0][0] >= BATCH_NS:
+                if isinstance(source, UdpSource):
+                    self.counts.kernel_drops = source.drops
+                self._hand_over()
+            if self._config.requests:
+                for data in self._requester.due(self.counts, now_ns):
+                    source.write(data)
+            self.progress()
+            self.pause(source.pause_s)
+
+    def _hand_over(self) -> None:
+        """Give the chunks to the recorder, and have a look at the frames in them."""
+        if not self._chunks:
+            return
+        chunks, self._chunks = self._chunks, []
+        stamp_ns = chunks[-1][0]
+        size = sum(len(data) for _, data in chunks)
+        self.counts.received_bytes += size
+        if not self._put(self._topic, stamp_ns, records.encode_raw(stamp_ns, chunks, self.name), True):
+            self.counts.queue_dropped_bytes += size
+        for time_ns, data in chunks:
+            note_frames(self.counts, self._parser.feed(time_ns, data))
+        self.counts.bad_bytes = self._parser.bad_bytes
+        self.counts.unknown_frames = self._parser.unknown
+
+    def _tell_trouble(self, sentence: str) -> None:
+        if sentence != self.counts.trouble:
+            _log.warning("link %s: %s; trying again", self.name, sentence)
+        self.counts.trouble = sentence
+
+    def _tell_connected(self) -> None:
+        self.counts.connected, self.counts.trouble = True, ""
+        self.counts.opened += 1
+        self._requester.start()
+        _log.info("link %s: %s is open", self.name, self._config.device)
+
+
+def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
+    """Count frames; those of an id we cannot verify are no sign of life."""
+    for frame in frames:
+        if not frame.known:
+            continue
+        counts.frames += 1
+        if frame.message_id == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+            _note_heartbeat(counts, frame)
+        if (frame.system, frame.component) == counts.autopilot:
+            counts.messages[frame.message_id] += 1
+            counts.newest_ns = frame.time_ns
+
+
+def _note_heartbeat(counts: LinkCounts, frame: Frame) -> None:
+    """The autopilot is the first that says it is one; others on the link (gimbals, ground stations) are not."""
+    heartbeat = decode(frame)
+    if heartbeat is None or heartbeat.autopilot == AUTOPILOT_INVALID:
+        return
+    sender = (frame.system, frame.component)
+    if counts.autopilot is None:
+        counts.autopilot = sender
+        _log.info("autopilot %d/%d heard, MAVLink %d", *sender, frame.version)
+    if sender == counts.autopilot:
+        counts.heartbeats += 1
+        counts.version = frame.version
+        counts.armed = bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+
+class Requester:
+    """What to send to the autopilot, and when: our heartbeat each second, and requests for streams that come too slowly.
+
+    ArduCopter 3.1.3 knows only REQUEST_DATA_STREAM, and only as MAVLink 1: we answer in the version that the autopilot speaks.
+    """
+
+    def __init__(self, streams: StreamsConfig) -> None:
+        self._streams = [
+            (stream, rate, message) for option, stream, message in _STREAMS if (rate := getattr(streams, option))
+        ]
+        self._mavlink = dialect.MAVLink(None, srcComponent=COMPONENT)
+        self.requests = 0
+        self.start()
+
+    def start(self) -> None:
+        """Begin anew, on a link that was just opened."""
+        self._heartbeat_ns = 0
+        self._checked_ns: int | None = None
+        self._before: Counter[int] = Counter()
+
+    def due(self, counts: LinkCounts, now_ns: int) -> list[bytes]:
+        """Frames to send now; `now_ns` is log time."""
+        if counts.autopilot is None or now_ns - self._heartbeat_ns < NS_PER_S:
+            return []
+        self._heartbeat_ns = now_ns
+        self._mavlink.srcSystem = counts.autopilot[0]
+        heartbeat = self._mavlink.heartbeat_encode(
+            dialect.MAV_TYPE_ONBOARD_CONTROLLER, AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE
+        )
+        messages = [heartbeat, *self._requests(counts, counts.autopilot, now_ns)]
+        return [bytes(message.pack(self._mavlink, force_mavlink1=counts.version == 1)) for message in messages]
+
+    def _requests(self, counts: LinkCounts, autopilot: tuple[int, int], now_ns: int) -> list[dialect.MAVLink_message]:
+        if self._checked_ns is None:
+            low = self._streams
+        elif now_ns - self._checked_ns < _CHECK_NS:
+            return []
+        else:
+            seconds = (now_ns - self._checked_ns) / NS_PER_S
+            low = [
+                (stream, rate, message)
+                for stream, rate, message in self._streams
+                if counts.messages[message] - self._before[message] < _LOW * rate * seconds
+            ]
+        self._checked_ns, self._before = now_ns, Counter(counts.messages)
+        self.requests += len(low)
+        return [self._mavlink.request_data_stream_encode(*autopilot, stream, rate, 1) for stream, rate, _ in low]

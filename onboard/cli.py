@@ -1,0 +1,93 @@
+"""The command line of `swathd`."""
+
+import argparse
+import logging
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from flightlog import __version__
+from flightlog.errors import SwathError
+
+_CONFIG = Path("/etc/swathd/swathd.yaml")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; gives the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        return int(options.command(options))
+    except SwathError as error:
+        print(f"swathd: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="swathd", description="Records the lidar and the autopilot to a flight log.")
+    parser.add_argument("--version", action="version", version=f"swathd {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="record until told to stop")
+    _add_config(run)
+    run.set_defaults(command=_run)
+
+    sample = commands.add_parser("config", help="print a configuration file with every option and its default")
+    sample.set_defaults(command=_sample)
+
+    health = commands.add_parser("health", help="say how it goes; exit code 0 good, 1 warning, 2 critical")
+    _add_config(health)
+    health.add_argument("--json", action="store_true", help="the whole status, with the verdict")
+    health.set_defaults(command=_health)
+    return parser
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--config", type=Path, default=_CONFIG, metavar="FILE", help=f"configuration (default {_CONFIG})"
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    from onboard import config, daemon
+
+    # the journal has its own clock
+    style = "%(message)s" if "JOURNAL_STREAM" in os.environ else "%(asctime)s %(levelname)s %(message)s"
+    logging.basicConfig(level=logging.INFO, format=style, stream=sys.stderr)
+    daemon.run(config.load(options.config), options.config)
+    return 0
+
+
+def _sample(options: argparse.Namespace) -> int:
+    from flightlog.config import sample
+    from onboard.config import SwathdConfig
+
+    del options
+    print(sample(SwathdConfig), end="")
+    return 0
+
+
+def _health(options: argparse.Namespace) -> int:
+    import json
+
+    from onboard import config, health
+
+    path = config.load(options.config).status_path(os.environ.get("RUNTIME_DIRECTORY"))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SwathError(f"{path}: the status cannot be read ({error.strerror}); swathd has not run") from None
+    status = health.from_json(text, str(path))
+    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    verdict = health.judge(status, time.monotonic_ns(), boot_id)
+    if options.json:
+        tree = {"verdict": verdict.level.name, "findings": verdict.findings, "status": json.loads(text)}
+        print(json.dumps(tree, indent=1))
+    else:
+        print("\n".join(health.report(status, verdict)))
+    return int(verdict.level)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

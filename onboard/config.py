@@ -1,0 +1,137 @@
+"""What the operator of the aircraft may set; `swathd config` prints the file with every default."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from flightlog import config
+from flightlog.config import option
+from flightlog.hdl32e import DATA_PORT, POSITION_PORT
+
+_UDP: Final = "udp:"
+
+
+@dataclass(frozen=True, slots=True)
+class FovConfig:
+    """The sector that is recorded, clockwise from start to end as the sensor counts its azimuth."""
+
+    start_deg: float = option(255.0, "where it begins, azimuth of the sensor [deg]", minimum=0, maximum=360)
+    end_deg: float = option(
+        105.0, "where it ends, clockwise; equal to the start: the full circle [deg]", minimum=0, maximum=360
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LidarConfig:
+    """The HDL-32E's two UDP ports."""
+
+    address: str = option("0.0.0.0", "local address to listen on; 0.0.0.0 also takes broadcasts")
+    data_port: int = option(DATA_PORT, "port of the data packets", minimum=1, maximum=65535)
+    position_port: int = option(POSITION_PORT, "port of the position packets", minimum=1, maximum=65535)
+    receive_buffer_kb: int = option(
+        8192, "kernel receive buffer; 8192 bridges a stall of 4 s [kB]", minimum=16, maximum=262144
+    )
+    poll_ms: int = option(
+        20, "how often the sockets are emptied; receive times are the kernel's and do not depend on it [ms]",
+        minimum=1, maximum=200,
+    )  # fmt: skip
+    fov: FovConfig = option(FovConfig, "what is kept; the rest looks at the airframe")
+
+
+@dataclass(frozen=True, slots=True)
+class StreamsConfig:
+    """Rates to ask an ArduPilot for; ArduCopter 3.1.3 answers 50 with 25 Hz, its highest."""
+
+    raw_sensors_hz: int = option(50, "RAW_IMU; 0: do not ask for it [Hz]", minimum=0, maximum=400)
+    extended_status_hz: int = option(5, "GPS_RAW_INT, SYS_STATUS [Hz]", minimum=0, maximum=400)
+    position_hz: int = option(10, "GLOBAL_POSITION_INT [Hz]", minimum=0, maximum=400)
+    extra1_hz: int = option(50, "ATTITUDE [Hz]", minimum=0, maximum=400)
+    extra2_hz: int = option(2, "VFR_HUD [Hz]", minimum=0, maximum=400)
+    extra3_hz: int = option(2, "SYSTEM_TIME, AHRS [Hz]", minimum=0, maximum=400)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """One MAVLink link."""
+
+    device: str | None = field(
+        metadata={"about": "serial device, or udp:ADDRESS:PORT to listen on; null: there is no such link"}
+    )
+    baud: int = option(57600, "of the serial device [baud]", minimum=1200, maximum=4_000_000)
+    request_streams: bool | None = option(
+        None, "ask the autopilot for the rates below; null: on a serial device yes, on UDP no"
+    )
+    streams: StreamsConfig = option(StreamsConfig, "rates to ask for")
+
+    def __post_init__(self) -> None:
+        if self.device is not None and self.device.startswith(_UDP):
+            self.udp_address()
+
+    @property
+    def serial(self) -> bool:
+        """Whether the device is a serial one."""
+        return self.device is not None and not self.device.startswith(_UDP)
+
+    def udp_address(self) -> tuple[str, int]:
+        """Address and port of a `udp:` device; ValueError where it is not one."""
+        host, _, port = (self.device or "").removeprefix(_UDP).rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+            raise ValueError(f"device {self.device!r} found, expected udp:ADDRESS:PORT")
+        return host, int(port)
+
+    @property
+    def requests(self) -> bool:
+        """Whether to ask for streams."""
+        return self.serial if self.request_streams is None else self.request_streams
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderConfig:
+    """Where flight logs go and how often they are made safe."""
+
+    directory: str = option("/var/lib/swathd", "folder of the flight logs; made if it is not there")
+    sync_ms: int = option(
+        500, "how often the log is forced on to the disk; a power cut loses about this much [ms]",
+        minimum=50, maximum=10_000,
+    )  # fmt: skip
+    backlog_mb: int = option(
+        24, "memory for what the disk has not taken yet; 24 holds 10 s [MB]", minimum=1, maximum=1024
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SwathdConfig:
+    """Everything `swathd run` needs to know."""
+
+    lidar: LidarConfig = option(LidarConfig, "Velodyne HDL-32E")
+    ins: LinkConfig = field(
+        default_factory=lambda: LinkConfig(device="/dev/swath-ins"),
+        metadata={"about": "MAVLink of the autopilot board that measures; topic /mavlink/ins"},
+    )
+    fc: LinkConfig = field(
+        default_factory=lambda: LinkConfig(device=None),
+        metadata={"about": "MAVLink of the board that flies, where it is another one; topic /mavlink/fc"},
+    )
+    recorder: RecorderConfig = option(RecorderConfig, "flight logs")
+    mount: str | None = option(
+        None, "mount file that goes into every log, relative to this file; null: the nominal mount"
+    )
+    status_file: str | None = option(
+        None, "written every second; null: status.json in systemd's runtime folder, else beside the logs"
+    )
+
+    def links(self) -> dict[str, LinkConfig]:
+        """The links there are, by name."""
+        named = {"ins": self.ins, "fc": self.fc}
+        return {name: link for name, link in named.items() if link.device is not None}
+
+    def status_path(self, runtime_directory: str | None) -> Path:
+        """Where the status file goes; `runtime_directory` is what systemd says, if it does."""
+        if self.status_file is not None:
+            return Path(self.status_file)
+        return Path(runtime_directory or self.recorder.directory) / "status.json"
+
+
+def load(path: str | Path) -> SwathdConfig:
+    """Read a configuration file; ConfigError where it is not one."""
+    return config.load(path, SwathdConfig)

@@ -1,0 +1,297 @@
+"""Start, run, stop. Signals set a flag; the watchdog is earned; whatever happens, the log is closed well."""
+
+import logging
+import os
+import platform
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from flightlog import __version__, config, records
+from flightlog.constants import NS_PER_MS, NS_PER_S
+from flightlog.errors import SwathError
+from flightlog.mount import Mount, load_mount
+from onboard import health, notify
+from onboard.autopilot import Link, LinkCounts
+from onboard.config import SwathdConfig
+from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status
+from onboard.lidar import LidarCounts, LidarPort
+from onboard.recorder import Recorder, Segment, next_segment_path, write_atomically
+from onboard.timesync import ClockWatch, LogTime, read_clocks
+from onboard.worker import Worker
+
+_log = logging.getLogger(__name__)
+
+_STATUS_S: Final = 1.0
+_TICK_S: Final = 0.1
+
+
+class Daemon:
+    """The running whole.
+
+    Parameters
+    ----------
+    settings : SwathdConfig
+    config_path : Path
+        Where they came from; a relative mount file is beside it.
+
+    Raises
+    ------
+    SwathError
+        A port is taken, the folder is not writable, the mount file is wrong.
+    """
+
+    def __init__(self, settings: SwathdConfig, config_path: Path) -> None:
+        mount = Mount() if settings.mount is None else load_mount(config_path.parent / settings.mount)
+        started = read_clocks()
+        self._log_time = LogTime.start(started)
+        self._clock_watch = ClockWatch(self._log_time)
+        self._started_ns = started.monotonic_ns
+        self._boot_id = boot_id()
+        self._directory = Path(settings.recorder.directory)
+        self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
+        self._stop = threading.Event()
+        self._links: dict[str, Link] = {}
+
+        # The ports first: packets wait in their buffers while the log is opened.
+        self._recorder: Recorder | None = None
+        self._lidar = LidarPort(settings.lidar, self._log_time, self._put)
+        try:
+            self._recorder = Recorder(settings.recorder, self._open_segment(settings, mount))
+        except BaseException:
+            self._lidar.close()
+            raise
+        for name, link in settings.links().items():
+            self._links[name] = Link(name, link, self._log_time, self._put)
+        self._rates = _Rates()
+
+    def _open_segment(self, settings: SwathdConfig, mount: Mount) -> Segment:
+        path = next_segment_path(self._directory, self._boot_id)
+        clock = self._clock_watch.record()
+        fov = settings.lidar.fov
+        session = {
+            "boot_id": self._boot_id,
+            "host": platform.node(),
+            "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+            "version": __version__,
+            "log_minus_monotonic_ns": str(self._log_time.anchor_ns),
+            "fov_start_deg": f"{fov.start_deg:g}",
+            "fov_end_deg": f"{fov.end_deg:g}",
+            "segment": path.stem,
+        }
+        topics = [records.LIDAR.topic, records.LIDAR_ACCOUNT.topic, records.POSITION.topic]
+        topics += [records.MAVLINK.topic + name for name in settings.links()]
+        return Segment(
+            path,
+            metadata={"swath.session": session, "foxglove": {"deviceName": platform.node()}},
+            attachments={"config.yaml": config.dump(settings).encode(), "mount.yaml": mount.yaml().encode()},
+            topics=topics,
+            first=(records.HOST_CLOCK.topic, clock.log_ns, records.encode_host_clock(clock)),
+        )
+
+    def _put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
+        assert self._recorder is not None
+        return self._recorder.put(topic, log_time_ns, data, vital)
+
+    def stop(self) -> None:
+        """Ask `run` to end; safe in a signal handler."""
+        self._stop.set()
+
+    @property
+    def _workers(self) -> list[Worker]:
+        """In the order in which they are stopped: who writes comes last."""
+        assert self._recorder is not None
+        return [self._lidar, *self._links.values(), self._recorder]
+
+    def run(self) -> None:
+        """Record until `stop`.
+
+        Raises
+        ------
+        SwathError
+            A worker died; the log was closed as well as could be.
+        """
+        for worker in reversed(self._workers):
+            worker.start()
+        _log.info("recording to %s", self._directory / self._segment_name)
+        try:
+            self._attend()
+        finally:
+            notify.stopping()
+            for worker in self._workers:
+                worker.stop()
+        self._write_status(self._status())
+        if failures := self._failures():
+            raise SwathError("; ".join(failures))
+        _log.info("closed %s", self._directory / self._segment_name)
+
+    @property
+    def _segment_name(self) -> str:
+        assert self._recorder is not None
+        return self._recorder.counts.segment
+
+    def _attend(self) -> None:
+        """Clocks, status and watchdog, once a second, until asked to stop or a worker died."""
+        is_ready = False
+        next_ns = 0
+        while not self._stop.is_set() and not self._failures():
+            now_ns = time.monotonic_ns()
+            if now_ns < next_ns:
+                self._stop.wait(_TICK_S)
+                continue
+            next_ns = now_ns + round(_STATUS_S * NS_PER_S)
+            clock = self._clock_watch.record()
+            if abs(clock.step_ns) > NS_PER_S:
+                _log.warning("the wall clock was set by %.3f s; log time goes on evenly", clock.step_ns / NS_PER_S)
+            self._put(records.HOST_CLOCK.topic, clock.log_ns, records.encode_host_clock(clock), True)
+            status = self._status()
+            self._write_status(status)
+            if not is_ready:
+                notify.ready(health.summary(status))
+                is_ready = True
+            self._stroke(status, now_ns)
+
+    def _stroke(self, status: Status, now_ns: int) -> None:
+        """Tell systemd that all is well, if it is."""
+        reasons = health.stalled({worker.name: worker.progress_ns for worker in self._workers}, now_ns)
+        if reasons:
+            _log.error("%s", "; ".join(reasons))
+            notify.status("; ".join(reasons))
+        else:
+            notify.status(health.summary(status))
+            notify.watchdog()
+
+    def _failures(self) -> list[str]:
+        found = [worker.failure for worker in self._workers if worker.failure]
+        found += [f"{w.name} ended by itself" for w in self._workers if _ended(w) and not self._stop.is_set()]
+        return found
+
+    # Status -------------------------------------------------------------------------------------------------------
+
+    def _write_status(self, status: Status) -> None:
+        try:
+            write_atomically(self._status_path, health.to_json(status), sync=False)
+        except OSError as error:
+            _log.error("status file %s cannot be written (%s)", self._status_path, error.strerror)
+
+    def _status(self) -> Status:
+        now = read_clocks()
+        log_ns = self._log_time.at(now)
+        self._rates.begin(now.monotonic_ns)
+        return Status(
+            time_ns=now.monotonic_ns,
+            boot_id=self._boot_id,
+            version=__version__,
+            pid=os.getpid(),
+            uptime_s=(now.monotonic_ns - self._started_ns) / NS_PER_S,
+            clock_steps=self._clock_watch.steps,
+            lidar=_lidar_status(self._lidar.counts, log_ns, self._rates.per_second),
+            links={
+                name: _link_status(name, link.counts, log_ns, self._rates.per_second)
+                for name, link in self._links.items()
+            },
+            recorder=self._recorder_status(now.monotonic_ns),
+            failures=self._failures(),
+        )
+
+    def _recorder_status(self, now_ns: int) -> RecorderStatus:
+        assert self._recorder is not None
+        counts, backlog = self._recorder.counts, self._recorder.backlog
+        disk = os.statvfs(self._directory)
+        return RecorderStatus(
+            segment=counts.segment,
+            messages=counts.messages,
+            bytes_on_disk=counts.bytes_on_disk,
+            backlog_bytes=backlog.size_bytes,
+            refused=backlog.refused,
+            sync_age_s=(now_ns - counts.last_sync_ns) / NS_PER_S,
+            slowest_sync_ms=counts.slowest_sync_ms,
+            free_bytes=disk.f_bavail * disk.f_frsize,
+        )
+
+
+def _ended(worker: Worker) -> bool:
+    return worker.ident is not None and not worker.is_alive()
+
+
+class _Rates:
+    """Counts per second, from one status to the next."""
+
+    def __init__(self) -> None:
+        self._then_ns = self._now_ns = time.monotonic_ns()
+        self._counts: dict[str, int] = {}
+
+    def begin(self, now_ns: int) -> None:
+        """Begin a status."""
+        self._then_ns, self._now_ns = self._now_ns, now_ns
+
+    def per_second(self, name: str, count: int) -> float:
+        """Rate of a count since the status before."""
+        new = count - self._counts.get(name, 0)
+        self._counts[name] = count
+        return round(new * NS_PER_S / max(self._now_ns - self._then_ns, NS_PER_MS), 1)
+
+
+_PerSecond = Callable[[str, int], float]
+
+
+def _age_s(newest_ns: int, log_ns: int) -> float | None:
+    return (log_ns - newest_ns) / NS_PER_S if newest_ns else None
+
+
+def _lidar_status(counts: LidarCounts, log_ns: int, per_second: _PerSecond) -> LidarStatus:
+    return LidarStatus(
+        age_s=_age_s(counts.newest_ns, log_ns),
+        packets_s=per_second("lidar", counts.received),
+        position_packets_s=per_second("position", counts.position_received),
+        received=counts.received,
+        kept=counts.kept,
+        masked_packets=counts.masked_packets,
+        kernel_drops=counts.kernel_drops,
+        queue_drops=counts.queue_drops,
+        position_kept=counts.position_kept,
+        position_drops=counts.position_kernel_drops + counts.position_queue_drops,
+        rejected=dict(counts.rejected),
+        pps=counts.pps,
+        nmea=counts.nmea,
+    )
+
+
+def _link_status(name: str, counts: LinkCounts, log_ns: int, per_second: _PerSecond) -> LinkStatus:
+    return LinkStatus(
+        connected=counts.connected,
+        trouble=counts.trouble,
+        age_s=_age_s(counts.newest_ns, log_ns),
+        frames_s=per_second(f"{name} frames", counts.frames),
+        bytes_s=per_second(f"{name} bytes", counts.received_bytes),
+        autopilot="" if counts.autopilot is None else "{}/{}".format(*counts.autopilot),
+        version=counts.version,
+        heartbeats=counts.heartbeats,
+        armed=counts.armed,
+        bad_bytes=counts.bad_bytes,
+        unknown_frames=counts.unknown_frames,
+        dropped_bytes=counts.queue_dropped_bytes,
+        kernel_drops=counts.kernel_drops,
+    )
+
+
+def boot_id() -> str:
+    """What tells this boot of the machine from every other."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+
+
+def run(settings: SwathdConfig, config_path: Path) -> None:
+    """Record until SIGTERM or SIGINT; see Daemon for the errors."""
+    daemon = Daemon(settings, config_path)
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        daemon.stop()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    daemon.run()

@@ -1,0 +1,151 @@
+"""UDP reception: many datagrams in one system call, each with the kernel's receive time; losses in the socket counted by it too.
+
+recvmmsg(2) fills an array in place. What makes it cheap is the caller's habit of coming only every few milliseconds: a call that
+waits would wake up for each packet. Structures are those of a 64-bit Linux.
+"""
+
+import ctypes
+import errno
+import os
+import socket
+import struct
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.constants import NS_PER_S
+from flightlog.errors import SourceError
+
+SO_TIMESTAMPNS: Final = 35
+SO_RXQ_OVFL: Final = 40
+SO_MEMINFO: Final = 55
+_MEMINFO_DROPS: Final = 8
+"""Index into what SO_MEMINFO gives (linux/sock_diag.h, SK_MEMINFO_DROPS)."""
+MAX_DATAGRAMS: Final = 1024
+"""The kernel takes no more in one call (UIO_MAXIOV)."""
+
+_IOVEC_DTYPE: Final = np.dtype([("base", "<u8"), ("size", "<u8")])
+_MESSAGE_DTYPE: Final = np.dtype(
+    {
+        "names": ["name", "name_size", "iov", "iov_count", "control", "control_size", "flags", "size"],
+        "formats": ["<u8", "<u4", "<u8", "<u8", "<u8", "<u8", "<i4", "<u4"],
+        "offsets": [0, 8, 16, 24, 32, 40, 48, 56],
+        "itemsize": 64,
+    }
+)
+"""struct mmsghdr."""
+_CONTROL_DTYPE: Final = np.dtype(
+    [
+        ("size", "<u8"), ("level", "<i4"), ("kind", "<i4"), ("sec", "<i8"), ("nanosec", "<i8"),
+        ("drops_size", "<u8"), ("drops_level", "<i4"), ("drops_kind", "<i4"), ("drops", "<u4"), ("pad", "<u4"),
+    ]
+)  # fmt: skip
+"""The two control messages of a datagram: SO_TIMESTAMPNS always, then SO_RXQ_OVFL once anything was dropped (sock_recv_cmsgs)."""
+_WITH_TIME: Final = 32
+_WITH_DROPS: Final = 52
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
+_libc.recvmmsg.restype = ctypes.c_int
+
+
+def open_udp(address: str, port: int, receive_buffer_bytes: int) -> socket.socket:
+    """Open a socket that stamps what it receives and counts what it drops.
+
+    Raises
+    ------
+    SourceError
+        The port is taken, or the address is not ours.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+        sock.bind((address, port))
+    except OSError as error:
+        sock.close()
+        what = "another program has it" if error.errno == errno.EADDRINUSE else str(error.strerror or error)
+        raise SourceError(f"UDP port {port} at {address} cannot be opened: {what}") from None
+    return sock
+
+
+def granted_buffer_bytes(sock: socket.socket) -> int:
+    """What the kernel gave of the receive buffer asked for; it counts its own bookkeeping double."""
+    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+class Receiver:
+    """Empties a socket into an array.
+
+    Parameters
+    ----------
+    sock : socket
+        From `open_udp`.
+    slots : ndarray, shape (n,), n <= 1024
+        Contiguous; a datagram goes into each element.
+    offset, size : int
+        Which bytes of an element it fills; what is longer is cut off and `sizes` says size + 1.
+
+    Attributes
+    ----------
+    sizes : ndarray of int64, shape (n,)
+        Bytes of each datagram received.
+    stamps_ns : ndarray of int64, shape (n,)
+        The kernel's receive time on the wall clock [ns]; 0 where it gave none.
+    drops : int
+        Datagrams lost in the socket since it was opened, as far as known.
+    """
+
+    def __init__(self, sock: socket.socket, slots: npt.NDArray[np.generic], offset: int, size: int) -> None:
+        count = len(slots)
+        assert slots.flags.c_contiguous
+        assert count <= MAX_DATAGRAMS
+        assert offset + size <= slots.dtype.itemsize
+        self._sock, self._slots, self._limit = sock, slots, size
+        self.sizes = np.zeros(count, np.int64)
+        self.stamps_ns = np.zeros(count, np.int64)
+        self.drops = 0
+        self._iov = np.zeros(count, _IOVEC_DTYPE)
+        self._control = np.zeros(count, _CONTROL_DTYPE)
+        self._messages = np.zeros(count, _MESSAGE_DTYPE)
+        index = np.arange(count, dtype=np.uint64)
+        self._iov["base"] = slots.ctypes.data + offset + index * np.uint64(slots.dtype.itemsize)
+        self._iov["size"] = size
+        self._messages["iov"] = self._iov.ctypes.data + index * np.uint64(_IOVEC_DTYPE.itemsize)
+        self._messages["iov_count"] = 1
+        self._messages["control"] = self._control.ctypes.data + index * np.uint64(_CONTROL_DTYPE.itemsize)
+        self._messages["control_size"] = _CONTROL_DTYPE.itemsize
+
+    def receive(self, first: int = 0) -> int:
+        """Take what is waiting into the elements from `first` on; gives the number of datagrams, never waits."""
+        room = len(self._slots) - first
+        address = self._messages.ctypes.data + first * _MESSAGE_DTYPE.itemsize
+        count = int(_libc.recvmmsg(self._sock.fileno(), address, room, socket.MSG_DONTWAIT, None))
+        if count <= 0:
+            error = ctypes.get_errno() if count < 0 else 0
+            if error not in (0, errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED, errno.ENETDOWN):
+                raise OSError(error, os.strerror(error))
+            return 0
+        self._note(slice(first, first + count))
+        return count
+
+    def _note(self, part: slice) -> None:
+        messages, control = self._messages[part], self._control[part]
+        cut = messages["flags"] & socket.MSG_TRUNC != 0
+        self.sizes[part] = np.where(cut, self._limit + 1, messages["size"])
+        stamped = messages["control_size"] >= _WITH_TIME
+        self.stamps_ns[part] = np.where(stamped, control["sec"] * NS_PER_S + control["nanosec"], 0)
+        if messages["control_size"][-1] >= _WITH_DROPS:
+            self._count_drops(int(control["drops"][-1]))
+        messages["control_size"] = _CONTROL_DTYPE.itemsize
+
+    def count_last_drops(self) -> None:
+        """Ask the kernel for drops that no later datagram has told of."""
+        answer = self._sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 64)
+        if len(answer) >= 4 * (_MEMINFO_DROPS + 1):
+            self._count_drops(struct.unpack_from("<I", answer, 4 * _MEMINFO_DROPS)[0])
+
+    def _count_drops(self, counter: int) -> None:
+        self.drops += (counter - self.drops) % (1 << 32)

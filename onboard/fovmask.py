@@ -1,0 +1,110 @@
+"""The field of view: packets wholly outside are left out, blocks outside in a packet that straddles its edge lose their ranges.
+
+What lies inside is never touched. A block is not one direction: its 32 shots sweep on from the block's azimuth while the head
+turns, so a block stays if any of its shots lies inside.
+"""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.hdl32e import AZIMUTH_STEPS, FIRING_NS, LASER_NS, LASERS, ReturnMode
+
+LARGEST_STEP: Final = 100
+"""Upper bound on the azimuth from one firing to the next [0.01 deg]: three times the fastest head's (1200 rpm, 0.33 deg)."""
+
+_LAST_SHOT: Final = (LASERS - 1) * LASER_NS / FIRING_NS
+"""Where in the firing's sweep the last laser shoots, as a fraction of the azimuth step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The sector to keep, clockwise from start to end, both included [0.01 deg]; equal: the full circle."""
+
+    start: int
+    end: int
+
+    @classmethod
+    def from_degrees(cls, start_deg: float, end_deg: float) -> "Window":
+        """Make a window from azimuths [deg]; 360 is 0."""
+        return cls(round(start_deg * 100) % AZIMUTH_STEPS, round(end_deg * 100) % AZIMUTH_STEPS)
+
+    @property
+    def width(self) -> int:
+        """From start to end [0.01 deg]; 0 for the full circle."""
+        return (self.end - self.start) % AZIMUTH_STEPS
+
+
+class Masked(NamedTuple):
+    """What is kept, and how much was not."""
+
+    packets: npt.NDArray[np.void]
+    masked_packets: int
+    masked_blocks: int
+
+
+def apply(packets: npt.NDArray[np.void], window: Window) -> Masked:
+    """Keep what lies in a window.
+
+    Parameters
+    ----------
+    packets : ndarray of SCAN_PACKET_DTYPE, shape (n,)
+        Left as they are; what is changed is a copy.
+    window : Window
+
+    Returns
+    -------
+    Masked
+        packets, shape (m,); packets left out; blocks blanked (range 0, azimuth and intensity kept) in those that stay.
+    """
+    if window.width == 0:
+        return Masked(packets, 0, 0)
+    inside = blocks_inside(packets["data"]["blocks"]["azimuth"], packets["data"]["return_mode"], window)
+    stays = inside.any(axis=1)
+    kept = packets[stays]
+    packet, block = np.nonzero(~inside[stays])
+    if len(packet):
+        ranges = kept["data"]["blocks"]["returns"]["range"]
+        ranges[packet, block] = 0
+    return Masked(kept, len(packets) - len(kept), len(packet))
+
+
+def blocks_inside(
+    azimuth: npt.NDArray[np.uint16], return_mode: npt.NDArray[np.uint8], window: Window
+) -> npt.NDArray[np.bool_]:
+    """Which blocks have a shot inside the window.
+
+    Parameters
+    ----------
+    azimuth : ndarray of uint16, shape (n, 12)
+        Azimuths as sent [0.01 deg], 36000 included.
+    return_mode : ndarray of uint8, shape (n,)
+    window : Window
+
+    Returns
+    -------
+    ndarray of bool, shape (n, 12)
+    """
+    start = azimuth.astype(np.int32)
+    # Half a step more, because a decoder rounds the interpolated azimuth to 0.01 deg.
+    sweep = _LAST_SHOT * azimuth_step(start, return_mode)[:, None] + 0.5
+    past = (start - window.start) % AZIMUTH_STEPS
+    # The first shot inside, or the sweep reaches the start of the window.
+    return np.asarray((past <= window.width) | (past + sweep >= AZIMUTH_STEPS))
+
+
+def azimuth_step(azimuth: npt.NDArray[np.int32], return_mode: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:
+    """Azimuth from one firing to the next [0.01 deg], shape (n,).
+
+    The median over the packet, so that the gap of a sensor that limits its own field of view does not count; the largest possible
+    step where the azimuths make no sense. In dual return mode two blocks share a firing.
+    """
+    steps = np.diff(azimuth, axis=1) % AZIMUTH_STEPS
+    step = np.sort(steps, axis=1)[:, steps.shape[1] // 2]
+    dual = return_mode == ReturnMode.DUAL
+    if dual.any():
+        pairs = np.sort(np.diff(azimuth[dual, ::2], axis=1) % AZIMUTH_STEPS, axis=1)
+        step[dual] = pairs[:, pairs.shape[1] // 2]
+    return np.asarray(np.minimum(step, LARGEST_STEP))

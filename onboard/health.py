@@ -1,0 +1,225 @@
+"""The status of everything aboard, and the verdict on it: what is wrong, by name. Pure: readings in, sentences out."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Final
+
+from flightlog.constants import NS_PER_S
+from flightlog.errors import SwathError
+
+STALE_S: Final = 5.0
+"""A status older than this says nothing about now."""
+SILENT_S: Final = 1.0
+"""A lidar unheard for this long is silent; it sends every 0.6 ms."""
+LINK_SILENT_S: Final = 3.0
+"""An autopilot unheard for this long is silent; it sends a heartbeat each second."""
+STALLED_NS: Final = 5 * NS_PER_S
+"""A worker without progress for this long hangs; a slow card may well hold the recorder for a second or two."""
+
+
+class Level(IntEnum):
+    """Exit code of `swathd health`, as monitoring plug-ins have it."""
+
+    GOOD = 0
+    WARNING = 1
+    CRITICAL = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LidarStatus:
+    """The lidar's two ports; totals since the start, rates over the last second."""
+
+    age_s: float | None = None
+    """Since the newest good data packet; None: there was none."""
+    packets_s: float = 0.0
+    position_packets_s: float = 0.0
+    received: int = 0
+    kept: int = 0
+    masked_packets: int = 0
+    kernel_drops: int = 0
+    queue_drops: int = 0
+    position_kept: int = 0
+    position_drops: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    pps: int = 0
+    nmea: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatus:
+    """One MAVLink link."""
+
+    connected: bool = False
+    trouble: str = ""
+    age_s: float | None = None
+    """Since the newest verified frame of the autopilot; None: there was none."""
+    frames_s: float = 0.0
+    bytes_s: float = 0.0
+    autopilot: str = ""
+    version: int = 0
+    heartbeats: int = 0
+    armed: bool | None = None
+    bad_bytes: int = 0
+    unknown_frames: int = 0
+    dropped_bytes: int = 0
+    kernel_drops: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """The log being written."""
+
+    segment: str = ""
+    messages: int = 0
+    bytes_on_disk: int = 0
+    backlog_bytes: int = 0
+    refused: int = 0
+    sync_age_s: float = 0.0
+    slowest_sync_ms: float = 0.0
+    free_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Everything; what the status file holds."""
+
+    time_ns: int
+    """Monotonic clock when it was made [ns]: a step of the wall clock must not make it look stale."""
+    boot_id: str
+    version: str
+    pid: int
+    uptime_s: float
+    clock_steps: int
+    lidar: LidarStatus
+    links: dict[str, LinkStatus]
+    recorder: RecorderStatus
+    failures: list[str] = field(default_factory=list)
+
+
+def to_json(status: Status) -> str:
+    """The text of a status file."""
+    return json.dumps(dataclasses.asdict(status), indent=1) + "\n"
+
+
+def from_json(text: str, place: str) -> Status:
+    """Read the text of a status file; SwathError where it is none, `place` names it."""
+    try:
+        tree: dict[str, Any] = json.loads(text)
+        tree["lidar"] = LidarStatus(**tree["lidar"])
+        tree["links"] = {name: LinkStatus(**link) for name, link in tree["links"].items()}
+        tree["recorder"] = RecorderStatus(**tree["recorder"])
+        return Status(**tree)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise SwathError(f"{place}: is no status file of this version of swathd") from None
+
+
+def stalled(progress_ns: Mapping[str, int], now_ns: int, limit_ns: int = STALLED_NS) -> list[str]:
+    """Which workers have not got on for too long.
+
+    Parameters
+    ----------
+    progress_ns : mapping of name to int
+        When each last did [ns of the monotonic clock].
+    now_ns : int
+        The monotonic clock.
+    limit_ns : int
+    """
+    return [
+        f"{name} has made no progress for {(now_ns - then_ns) / NS_PER_S:.1f} s"
+        for name, then_ns in progress_ns.items()
+        if now_ns - then_ns > limit_ns
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How bad it is, and why: one sentence for each finding."""
+
+    level: Level
+    findings: list[str]
+
+
+def judge(status: Status, now_ns: int, boot_id: str) -> Verdict:
+    """Judge a status; `now_ns` is the monotonic clock of the boot `boot_id`."""
+    age_s = (now_ns - status.time_ns) / NS_PER_S
+    if status.boot_id != boot_id:
+        return Verdict(Level.CRITICAL, ["stale: the status is from before the last boot"])
+    if age_s > STALE_S:
+        return Verdict(Level.CRITICAL, [f"stale: the status is {age_s:.0f} s old; swathd does not run or hangs"])
+    found = [(Level.CRITICAL, failure) for failure in status.failures]
+    found += _judge_lidar(status.lidar)
+    for name, link in status.links.items():
+        found += _judge_link(name, link)
+    found += _judge_recorder(status.recorder)
+    return Verdict(max((level for level, _ in found), default=Level.GOOD), [text for _, text in found])
+
+
+def _judge_lidar(lidar: LidarStatus) -> list[tuple[Level, str]]:
+    found = []
+    if lidar.age_s is None and lidar.rejected:
+        found.append((Level.CRITICAL, "lidar: packets arrive, but none is an HDL-32E's"))
+    elif lidar.age_s is None:
+        found.append((Level.CRITICAL, "lidar: no packet yet; check power, cable and addresses"))
+    elif lidar.age_s > SILENT_S:
+        found.append((Level.CRITICAL, f"lidar: silent for {lidar.age_s:.0f} s"))
+    found += [(Level.WARNING, f"lidar: {count} x {reason}") for reason, count in lidar.rejected.items()]
+    if lidar.kernel_drops:
+        found.append((Level.WARNING, f"lidar: {lidar.kernel_drops} packets lost in the receive buffer"))
+    if lidar.queue_drops:
+        found.append((Level.WARNING, f"lidar: {lidar.queue_drops} packets lost because the disk was too slow"))
+    return found
+
+
+def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
+    if not link.connected:
+        return [(Level.WARNING, f"link {name}: {link.trouble or 'not open yet'}")]
+    if link.age_s is None:
+        return [(Level.WARNING, f"link {name}: open, but no autopilot heard")]
+    if link.age_s > LINK_SILENT_S:
+        return [(Level.WARNING, f"link {name}: autopilot silent for {link.age_s:.0f} s")]
+    if link.dropped_bytes:
+        return [(Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow")]
+    return []
+
+
+def _judge_recorder(recorder: RecorderStatus) -> list[tuple[Level, str]]:
+    if recorder.sync_age_s > STALLED_NS / NS_PER_S:
+        return [(Level.CRITICAL, f"recorder: nothing reached the disk for {recorder.sync_age_s:.0f} s")]
+    return []
+
+
+def summary(status: Status) -> str:
+    """One line for `systemctl status`."""
+    lidar, recorder = status.lidar, status.recorder
+    links = ", ".join(f"{name} {link.frames_s:.0f}/s" for name, link in status.links.items())
+    return (
+        f"{recorder.segment}: lidar {lidar.packets_s:.0f}/s, position {lidar.position_packets_s:.0f}/s, "
+        f"MAVLink {links or 'none'}, lost {lidar.kernel_drops + lidar.queue_drops}, "
+        f"{recorder.bytes_on_disk / 1e6:.0f} MB"
+    )
+
+
+def report(status: Status, verdict: Verdict) -> list[str]:
+    """The lines of `swathd health`."""
+    lidar, recorder = status.lidar, status.recorder
+    lines = [f"{verdict.level.name}: {summary(status)}", *(f"  {finding}" for finding in verdict.findings)]
+    lines.append(
+        f"lidar     {lidar.packets_s:.0f} packets/s, {lidar.kept} kept, {lidar.masked_packets} masked, "
+        f"{lidar.kernel_drops} + {lidar.queue_drops} dropped, GPS sentence {lidar.nmea or 'none'}"
+    )
+    for name, link in status.links.items():
+        heard = f"autopilot {link.autopilot}, MAVLink {link.version}" if link.autopilot else "no autopilot"
+        armed = {None: "unknown", True: "armed", False: "disarmed"}[link.armed]
+        lines.append(
+            f"{name:9} {link.frames_s:.0f} frames/s, {heard}, {armed}, {link.bad_bytes} bad bytes, "
+            f"{link.unknown_frames} unknown frames"
+        )
+    lines.append(
+        f"recorder  {recorder.segment}, {recorder.bytes_on_disk / 1e6:.1f} MB, last sync "
+        f"{recorder.sync_age_s:.1f} s ago, slowest {recorder.slowest_sync_ms:.0f} ms, "
+        f"{recorder.free_bytes / 1e9:.1f} GB free"
+    )
+    return lines
