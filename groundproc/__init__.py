@@ -1,0 +1,1 @@
+"""The ground side: flight log in, clouds, trajectories and figures about them out."""

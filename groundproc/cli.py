@@ -1,0 +1,90 @@
+"""`swath`: finds its commands by entry points, runs one, and turns errors of the outside world into one sentence."""
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from typing import Final
+
+GROUP: Final = "swath.commands"
+_INTERRUPTED: Final = 128 + signal.SIGINT
+_BROKEN_PIPE: Final = 128 + signal.SIGPIPE
+
+
+def commands() -> dict[str, EntryPoint]:
+    """All commands that installed packages offer, by name."""
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `swath` and give its exit code: 0, 1 for what went wrong outside, 2 for a wrong command line."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(words)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:
+        # whoever read our output has gone; keep the interpreter from flushing into the broken pipe once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BROKEN_PIPE
+    except Exception as error:
+        sentence, code = _outside(error)
+        print(f"swath: {sentence}", file=sys.stderr)
+    return code
+
+
+def _outside(error: Exception) -> tuple[str, int]:
+    """Sentence and exit code of an error that is not our own mistake; raises any other again."""
+    # imported late: the package loads numpy, which `swath --help` can do without
+    from flightlog.errors import SwathError
+
+    if isinstance(error, SwathError):
+        return str(error), error.exit_code
+    if isinstance(error, OSError):
+        reason = error.strerror or str(error)
+        return (f"{error.filename}: {reason}" if error.filename else reason), 1
+    raise error
+
+
+def _dispatch(words: list[str]) -> int:
+    found = commands()
+    if words and words[0] in found:
+        point = found[words[0]]
+        module = point.load()
+        parser = argparse.ArgumentParser(prog=f"swath {point.name}", description=module.HELP)
+        module.add_arguments(parser)
+        return int(module.run(parser.parse_args(words[1:])))
+    parser = argparse.ArgumentParser(
+        prog="swath",
+        description="Turns flight logs into point clouds.",
+        epilog=_listing(found) if not words or {"-h", "--help"} & set(words) else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="store_true", help="show the version and exit")
+    parser.add_argument("command", nargs="?", metavar="COMMAND", choices=list(found), help="see below")
+    if parser.parse_args(words).version:
+        print(f"swath {_version()}")
+        return 0
+    parser.print_help(sys.stderr)
+    return 2
+
+
+def _listing(found: dict[str, EntryPoint]) -> str:
+    """One line for each command."""
+    lines = ["commands (swath COMMAND --help says more):"]
+    for name, point in found.items():
+        try:
+            about = point.load().HELP
+        except ImportError as error:
+            about = f"not available here: {error}"
+        lines.append(f"  {name:<12}{about}")
+    return "\n".join(lines)
+
+
+def _version() -> str:
+    from flightlog import __version__
+
+    return __version__

@@ -1,0 +1,1 @@
+"""Recordings of other programs (Wireshark, tcpdump, Mission Planner, MAVProxy, ArduPilot) as streams of events with times."""
