@@ -1,0 +1,292 @@
+"""Flight logs into arrays: lidar batches, position samples and MAVLink frames, with the lidar's clock carried on.
+
+Several logs of one flight are read one after the other in the order of their times. What is read once per message is streamed;
+position samples, 200 a second, are given whole.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import clock, hdl32e, records
+from flightlog.constants import NS_PER_S, NS_PER_US, STANDARD_GRAVITY_M_S2
+from flightlog.logfile import LogReader
+from flightlog.mavlink import Frame, FrameParser
+from flightlog.records import LidarAccount
+
+Progress = Callable[[int], None]
+
+JUMP_NS: Final = NS_PER_S // 2
+"""Lidar and host clock drift apart by less than this between two batches; more, and one of them was set."""
+
+
+@dataclass(frozen=True, slots=True)
+class LidarBatch:
+    """The packets of one message, about 0.1 s.
+
+    Attributes
+    ----------
+    log_time_ns : int
+        Log time of the message [ns].
+    packets : ndarray of records.SCAN_PACKET_DTYPE, shape (n,)
+        May be empty: everything was masked.
+    receive_time_ns : ndarray of int64, shape (n,)
+        Receive times [ns of log time].
+    device_time_ns : ndarray of int64, shape (n,)
+        Stamps on the lidar's own clock, carried on over the hour and from log to log [ns]; the first lies within half an hour of
+        its receive time.
+    account : LidarAccount or None
+        What became of the packets; None where the log does not say.
+    jumped : bool
+        Either clock was set since the batch before: times before and after do not compare.
+    """
+
+    log_time_ns: int
+    packets: npt.NDArray[np.void]
+    receive_time_ns: npt.NDArray[np.int64]
+    device_time_ns: npt.NDArray[np.int64]
+    account: LidarAccount | None
+    jumped: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Sentence:
+    """A GPS sentence when it first appeared in a position packet."""
+
+    device_time_ns: int
+    receive_time_ns: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class PositionSamples:
+    """The position packets of a flight, in order.
+
+    Attributes
+    ----------
+    device_time_ns : ndarray of int64, shape (n,)
+        Stamps on the lidar's own clock, on the scale of LidarBatch.device_time_ns [ns].
+    receive_time_ns : ndarray of int64, shape (n,)
+        Receive times [ns of log time].
+    gyro_rad_s : ndarray of float64, shape (n, 3)
+        Angular rate in the sensor frame; zero offsets of tens of deg/s are normal.
+    accel_m_s2 : ndarray of float64, shape (n, 3)
+        Specific force in the sensor frame.
+    temperature_c : ndarray of float64, shape (n, 3)
+    has_imu : ndarray of bool, shape (n,)
+        Whether the packet carries readings of the gyros at all.
+    pps : ndarray of uint8, shape (n,)
+        hdl32e.PpsState.
+    sentences : list of Sentence
+        Each when it first appeared.
+    clock_jumps : int
+        How often the lidar's or the host's clock was set while they were recorded.
+    """
+
+    device_time_ns: npt.NDArray[np.int64]
+    receive_time_ns: npt.NDArray[np.int64]
+    gyro_rad_s: npt.NDArray[np.float64]
+    accel_m_s2: npt.NDArray[np.float64]
+    temperature_c: npt.NDArray[np.float64]
+    has_imu: npt.NDArray[np.bool_]
+    pps: npt.NDArray[np.uint8]
+    sentences: list[Sentence]
+    clock_jumps: int
+
+
+@dataclass(slots=True)
+class DeviceClock:
+    """Carries the stamps of one stream of the lidar's packets on, from batch to batch.
+
+    Attributes
+    ----------
+    device_ns, receive_ns : int or None
+        Of the last packet, or of another stream's first where this one is to use the same hour.
+    """
+
+    device_ns: int | None = None
+    receive_ns: int | None = None
+    jumps: int = 0
+
+    def extend(
+        self, stamps_us: npt.NDArray[np.uint32], receive_time_ns: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[np.int64], bool]:
+        """Lidar time [ns], shape (n,), of the next n > 0 stamps [us past the hour]; and whether a clock jumped before them."""
+        if self.device_ns is None or self.receive_ns is None:
+            stamp_ns = int(stamps_us[0]) * NS_PER_US
+            self.receive_ns = int(receive_time_ns[0])
+            self.device_ns = stamp_ns + clock.nearest_hour_ns(stamp_ns, self.receive_ns)
+        host_ns = np.concatenate([np.array([self.receive_ns], np.int64), receive_time_ns])
+        device_ns = clock.unwrap_top_of_hour_ns(stamps_us, host_ns, self.device_ns)
+        passed_ns = np.diff(device_ns, prepend=self.device_ns) - np.diff(host_ns)
+        jumped = bool((np.abs(passed_ns) > JUMP_NS).any())
+        self.jumps += jumped
+        self.device_ns, self.receive_ns = int(device_ns[-1]), int(receive_time_ns[-1])
+        return device_ns, jumped
+
+
+def in_order(readers: Sequence[LogReader]) -> list[LogReader]:
+    """The logs by the time of their first message."""
+    return sorted(readers, key=lambda reader: reader.start_ns)
+
+
+def first_stamp(readers: Sequence[LogReader]) -> DeviceClock:
+    """A clock that stands at the first lidar packet, or at the first position packet where there is none.
+
+    Every stream of the lidar starts from it, so that all of them agree about the hour.
+    """
+    topics = (records.LIDAR.topic, records.POSITION.topic)
+    for topic in topics:
+        for reader in in_order(readers):
+            for message in reader.messages((topic,)):
+                if topic == records.LIDAR.topic:
+                    packets = records.decode_scan(message.data)
+                    stamps_us, receive_ns = packets["data"]["stamp_us"], records.receive_time_ns(packets)
+                else:
+                    receive_ns, position = records.decode_position(message.data)
+                    stamps_us = position["stamp_us"]
+                if len(stamps_us):
+                    anchor = DeviceClock()
+                    anchor.extend(stamps_us[:1], receive_ns[:1])
+                    return anchor
+    return DeviceClock()
+
+
+def lidar_batches(readers: Sequence[LogReader], progress: Progress | None = None) -> Iterator[LidarBatch]:
+    """Stream the lidar packets of one or several logs, each message with its account."""
+    device = first_stamp(readers)
+    topics = (records.LIDAR.topic, records.LIDAR_ACCOUNT.topic)
+    for reader in in_order(readers):
+        pending = _Pending()
+        for message in reader.messages(topics, progress):
+            if message.log_time_ns != pending.log_time_ns:
+                if pending.filled:
+                    yield pending.batch(device)
+                pending = _Pending(message.log_time_ns)
+            if message.topic == records.LIDAR.topic:
+                pending.packets.append(records.decode_scan(message.data))
+            else:
+                pending.account = records.decode_account(message.data)
+        if pending.filled:
+            yield pending.batch(device)
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A batch of which packets and account, one log time, may come in either order."""
+
+    log_time_ns: int = -1
+    packets: list[npt.NDArray[np.void]] = field(default_factory=list)
+    account: LidarAccount | None = None
+
+    @property
+    def filled(self) -> bool:
+        return bool(self.packets) or self.account is not None
+
+    def batch(self, device: DeviceClock) -> LidarBatch:
+        packets = np.concatenate([np.empty(0, records.SCAN_PACKET_DTYPE), *self.packets])
+        receive_ns = records.receive_time_ns(packets)
+        if not len(packets):
+            return LidarBatch(self.log_time_ns, packets, receive_ns, receive_ns, self.account)
+        device_ns, jumped = device.extend(packets["data"]["stamp_us"], receive_ns)
+        return LidarBatch(self.log_time_ns, packets, receive_ns, device_ns, self.account, jumped)
+
+
+def position_samples(readers: Sequence[LogReader], progress: Progress | None = None) -> PositionSamples:
+    """Read all position packets of one or several logs."""
+    device = first_stamp(readers)
+    parts = []
+    sentences: list[Sentence] = []
+    for batch in position_batches(readers, device, progress):
+        parts.append(_samples(batch))  # not the packets: 512 bytes each, for the 37 that count
+        sentences += new_sentences(batch, sentences[-1].text if sentences else "")
+    device_ns, receive_ns, gyro, accel, temperature, has_imu, pps = (
+        np.concatenate(column) for column in zip(_NO_SAMPLES, *parts, strict=True)
+    )
+    return PositionSamples(device_ns, receive_ns, gyro, accel, temperature, has_imu, pps, sentences, device.jumps)
+
+
+def _samples(batch: "PositionBatch") -> tuple[npt.NDArray[Any], ...]:
+    """The columns of PositionSamples, in its order."""
+    packets = batch.packets
+    return (
+        batch.device_time_ns,
+        batch.receive_time_ns,
+        np.deg2rad(hdl32e.gyro_deg_s(packets)),
+        hdl32e.accel_g(packets) * STANDARD_GRAVITY_M_S2,
+        hdl32e.temperature_c(packets),
+        hdl32e.has_imu(packets),
+        packets["pps"].copy(),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PositionBatch:
+    """The position packets of one message; fields as in LidarBatch, packets of hdl32e.POSITION_DTYPE."""
+
+    packets: npt.NDArray[np.void]
+    receive_time_ns: npt.NDArray[np.int64]
+    device_time_ns: npt.NDArray[np.int64]
+
+
+_NO_SAMPLES: Final = _samples(
+    PositionBatch(np.empty(0, hdl32e.POSITION_DTYPE), np.empty(0, np.int64), np.empty(0, np.int64))
+)
+
+
+def position_batches(
+    readers: Sequence[LogReader], device: DeviceClock, progress: Progress | None = None
+) -> Iterator[PositionBatch]:
+    """Stream the position packets of one or several logs."""
+    for reader in in_order(readers):
+        for message in reader.messages((records.POSITION.topic,), progress):
+            receive_ns, packets = records.decode_position(message.data)
+            good = hdl32e.is_position(packets)
+            receive_ns, packets = receive_ns[good], packets[good]
+            if len(packets):
+                device_ns, _ = device.extend(packets["stamp_us"], receive_ns)
+                yield PositionBatch(packets, receive_ns, device_ns)
+
+
+def new_sentences(batch: PositionBatch, last: str) -> list[Sentence]:
+    """The sentences of a batch that differ from the one before, the first from `last`."""
+    texts = batch.packets["nmea"]
+    changed = np.ones(len(texts), np.bool_)
+    changed[1:] = texts[1:] != texts[:-1]
+    found: list[Sentence] = []
+    for i in np.flatnonzero(changed):
+        text = bytes(texts[i]).split(b"\x00")[0].decode("ascii", errors="replace").strip()
+        if text and text != last:
+            found.append(Sentence(int(batch.device_time_ns[i]), int(batch.receive_time_ns[i]), text))
+            last = text
+    return found
+
+
+def mavlink_frames(
+    readers: Sequence[LogReader],
+    link: str,
+    parser: FrameParser | None = None,
+    progress: Progress | None = None,
+) -> Iterator[Frame]:
+    """Stream the MAVLink frames of one link.
+
+    Parameters
+    ----------
+    readers : sequence of LogReader
+    link : str
+        Such as "ins" or "fc".
+    parser : FrameParser, optional
+        To look at its counters afterwards.
+    progress : callable, optional
+        Called with the number of file bytes done since the last call.
+
+    """
+    parser = FrameParser() if parser is None else parser
+    for reader in in_order(readers):
+        for message in reader.messages((records.MAVLINK.topic + link,), progress):
+            for time_ns, data in records.decode_raw(message.data):
+                yield from parser.feed(time_ns, data)
+    parser.finish()
