@@ -40,9 +40,10 @@ def mat_local_ins(heading: Angle, pitch: Angle, roll: Angle) -> Array:
 
 
 def attitude_of(mat_local_ins: Array) -> tuple[Array, Array, Array]:
-    """Heading (0 to 2 pi), pitch and roll [rad] of a column matrix "local from ins"; the inverse of `mat_local_ins`."""
+    """Heading (0 to below 2 pi), pitch and roll [rad] of a column matrix "local from ins"; the inverse of `mat_local_ins`."""
     m = np.asarray(mat_local_ins)
     heading = np.arctan2(m[..., 0, 1], m[..., 1, 1]) % (2 * np.pi)
+    heading = heading * (heading < 2 * np.pi)  # the remainder of a tiny negative angle rounds up to the full turn
     pitch = np.arcsin(np.clip(m[..., 2, 1], -1.0, 1.0))
     roll = np.arctan2(-m[..., 2, 0], m[..., 2, 2])
     return heading, pitch, roll
