@@ -18,6 +18,26 @@ from flightlog.errors import ConfigError
 T = TypeVar("T")
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML that refuses a key given twice, and leaves dates and times as the text they are."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"key {key.value!r} stands there twice", problem_mark=key.start_mark
+                )
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else None)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
 def option(
     default: Any,
     about: str,
@@ -66,8 +86,8 @@ def load(path: str | Path, cls: type[T]) -> T:
 def loads(text: str, cls: type[T], place: str) -> T:
     """Read YAML text; `place` names it in errors. See `load`."""
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        tree = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:  # PyYAML lets the last three through
         reason = " ".join(str(error).split())
         raise ConfigError(f"{place}: is not valid YAML ({reason})") from None
     return from_mapping({} if tree is None else tree, cls, place)
