@@ -1,0 +1,22 @@
+"""A world with known truth: what it sends is judged against the sensors' manuals and recordings, never against our decoder.
+
+Conventions beside those of `flightlog`
+---------------------------------------
+Time
+    `time_s` is true time in seconds since the simulation starts; `clocks` turns it into what each device believes.
+World
+    The local frame of `flightlog` (x east, y north, z up); its origin is stated in truth.json. Surfaces are triangles.
+Chance
+    Every source of noise draws from `chance.generator(seed, its own name, chunk)`, so that a result depends on neither the number
+    of workers nor on which other noise is switched on.
+
+Map
+---
+config, chance, clocks, geodesy       options; random streams; what each clock shows; local frame to latitude and longitude
+materials, meshes, buildings, scene   reflectances at 905 nm; shapes as triangles; houses; the named scenes
+route, flight                         where to fly; position, attitude and rates at any time
+rays, echoes, lidar, telemetry        beams against triangles; echoes of a beam; data packets; position packets
+ins, autopilot                        what the INS believes; what it says over MAVLink
+faults, capture, truth, render        what goes wrong; pcap and tlog; truth files; the chunks in order
+play, command                         live to UDP and a pty; `swath simulate`
+"""

@@ -1,0 +1,106 @@
+"""`swath simulate`: a flight in a world with known truth, as files, and played live on request."""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from simulator.config import Options
+
+HELP = "simulate a flight in a known world: flight log, pcap, tlog and the truth"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument("--scene", default="village", metavar="NAME", help="village, field, facade or panels (village)")
+    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of flight (20)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same bytes (1)")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for what is written")
+    parser.add_argument("--config", type=Path, metavar="YAML", help="options; --sample-config shows all")
+    parser.add_argument("--sample-config", action="store_true", help="print a commented file of all options and end")
+    parser.add_argument("--perfect", action="store_true", help="take every error out of the instruments")
+    parser.add_argument("--returns", choices=("strongest", "last", "dual"), help="return mode of the lidar")
+    parser.add_argument("--truth-points", action="store_true", help="write every true echo too (56 bytes each)")
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="threads that cast rays (2)")
+    live = parser.add_argument_group("live", "render first, then play in real time to UDP and a pseudo terminal")
+    live.add_argument("--live", action="store_true", help="play what was rendered")
+    live.add_argument("--host", default="127.0.0.1", help="address to send the lidar's packets to (127.0.0.1)")
+    live.add_argument("--lidar-port", type=int, default=2368, metavar="N", help="UDP port of the data packets (2368)")
+    live.add_argument(
+        "--position-port", type=int, default=8308, metavar="N", help="UDP port of the position packets (8308)"
+    )
+    live.add_argument("--pty-link", type=Path, metavar="PATH", help="symbolic link to make to the pseudo terminal")
+    live.add_argument(
+        "--wait", type=float, default=0.0, metavar="S", help="seconds between opening the terminal and playing"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Simulate, write, and play."""
+    from tqdm import tqdm
+
+    from flightlog import config
+    from flightlog.errors import UsageError
+    from simulator.config import Options
+    from simulator.play import Target, play
+    from simulator.render import CAPTURE, TLOG, Job, render
+
+    if arguments.sample_config:
+        print(config.sample(Options), end="")
+        return 0
+    if arguments.output is None:
+        raise UsageError("no folder to write to; say -o DIR")
+    job = Job(
+        arguments.scene,
+        arguments.duration,
+        arguments.seed,
+        arguments.output,
+        _options(arguments),
+        arguments.workers,
+        arguments.truth_points,
+    )
+    quiet = not sys.stderr.isatty()
+    with tqdm(total=job.duration_s, unit="s", desc="simulate", disable=quiet, bar_format=_BAR) as bar:
+        simulation = render(job, bar.update)
+    print(f"{job.directory}: {job.duration_s:g} s of {job.scene}, seed {job.seed}, {simulation.chunks} batches")
+    if arguments.live:
+        target = Target(
+            arguments.host, arguments.lidar_port, arguments.position_port, arguments.pty_link, arguments.wait
+        )
+        with tqdm(total=job.duration_s, unit="s", desc="play", disable=quiet, bar_format=_BAR) as bar:
+            played = play(
+                job.directory / CAPTURE, job.directory / TLOG, target, announce=_announce, progress=bar.update
+            )
+        print(
+            f"played {played.packets} packets and {played.frames} MAVLink frames, {played.unread_bytes} bytes unread, "
+            f"at most {played.worst_late_s * 1e3:.1f} ms late"
+        )
+    return 0
+
+
+_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"
+
+
+def _announce(path: str) -> None:
+    print(f"MAVLink on {path}", flush=True)
+
+
+def _options(arguments: argparse.Namespace) -> "Options":
+    """The options of the command line; UsageError for values that cannot be."""
+    from flightlog import config
+    from flightlog.errors import UsageError
+    from simulator.config import Options, perfect
+
+    for value, least, name in (
+        (arguments.duration, 1.0, "--duration"),
+        (arguments.seed, 0, "--seed"),
+        (arguments.workers, 1, "--workers"),
+    ):
+        if not value >= least:
+            raise UsageError(f"{name}: {value} found, expected at least {least:g}")
+    options = Options() if arguments.config is None else config.load(arguments.config, Options)
+    if arguments.returns is not None:
+        options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, returns=arguments.returns))
+    return perfect(options) if arguments.perfect else options

@@ -1,0 +1,203 @@
+"""Every option of the simulator: what is in the world is the scene's; what is wrong with the instruments stands here.
+
+The defaults are those of wire.md's measurements on real units and of low-cost autopilots; `perfect` takes every error out.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+from flightlog.config import option
+
+
+@dataclass(frozen=True, slots=True)
+class LidarOptions:
+    """The HDL-32E's beams and rotor."""
+
+    rpm: float = option(600.0, "rotor speed [1/min]", minimum=300, maximum=1200)
+    returns: str = option("strongest", "return mode", choices=("strongest", "last", "dual"))
+    range_noise_m: float = option(0.015, "noise of a range, one sigma [m]", minimum=0, maximum=1)
+    laser_bias_m: float = option(
+        0.0, "constant range error of each laser, one sigma over lasers [m]", minimum=0, maximum=1
+    )
+    intensity_noise: float = option(
+        0.15, "fluctuation of a return's strength, one sigma, relative", minimum=0, maximum=1
+    )
+    encoder_noise_deg: float = option(0.004, "noise of the azimuth reported, one sigma [deg]", minimum=0, maximum=1)
+    footprint_mrad: float = option(2.79, "full divergence of a beam; 0: a line [mrad]", minimum=0, maximum=20)
+    blind_beyond_m: float = option(
+        21.5, "distance at which the 4.6 % panel is lost [m]; sets the detection threshold", minimum=1, maximum=1e4
+    )
+    max_range_m: float = option(100.0, "no return from beyond [m]", minimum=1, maximum=131)
+    airframe: bool = option(True, "legs and body return short ranges outside +-105 deg")
+
+
+@dataclass(frozen=True, slots=True)
+class GyroOptions:
+    """Gyros and accelerometers inside the lidar, as its position packets carry them."""
+
+    offset_deg_s: tuple[float, float, float] = option(
+        (-23.1, -7.1, -12.3), "zero offsets of gyro 1, 2, 3 [deg/s]; tens are normal", minimum=-150, maximum=150
+    )
+    noise_deg_s: float = option(1.1, "white noise of a sample, one sigma [deg/s]", minimum=0, maximum=50)
+    rotor_line_deg_s: float = option(0.3, "amplitude at the rotor's frequency [deg/s]", minimum=0, maximum=50)
+    accel_noise_g: float = option(0.015, "white noise of a sample, one sigma [g]", minimum=0, maximum=2)
+    accel_rotor_line_g: float = option(0.04, "amplitude at the rotor's frequency [g]", minimum=0, maximum=2)
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOptions:
+    """What each clock shows, and how fast it goes."""
+
+    start_utc: str = option("2026-05-20T10:17:03Z", "UTC at the start")
+    host_error_s: float = option(0.8, "host clock minus UTC at the start [s]", minimum=-1e9, maximum=1e9)
+    host_drift_ppm: float = option(3.0, "host clock fast by [ppm]", minimum=-1000, maximum=1000)
+    lidar_on_s: float = option(1012.25, "how long the lidar has been on at the start [s]", minimum=0, maximum=1e6)
+    lidar_drift_ppm: float = option(
+        58.0, "lidar clock fast by [ppm], where no GPS steers it", minimum=-1000, maximum=1000
+    )
+    lidar_gps: bool = option(
+        False, "the lidar has its own GPS: stamps are microseconds past the UTC hour, GPRMC is there"
+    )
+    boot_s: float = option(83.412, "how long the INS has been on at the start [s]", minimum=0, maximum=5e6)
+    boot_drift_ppm: float = option(-12.0, "INS clock fast by [ppm]", minimum=-1000, maximum=1000)
+    arrival_jitter_us: float = option(
+        30.0, "jitter of the lidar packets' arrival, one sigma [us]", minimum=0, maximum=1e5
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """Motion beyond the route."""
+
+    vibration_deg: float = option(
+        0.03, "rotor vibration of each attitude angle, rms [deg], 15 to 40 Hz", minimum=0, maximum=5
+    )
+    wander_deg: float = option(
+        1.6, "tilt from gusts and control, rms of roll and of pitch [deg]", minimum=0, maximum=10
+    )
+    drag_1_s: float = option(
+        0.25, "air drag per mass: a multirotor leans into its own speed [1/s]", minimum=0, maximum=5
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class InsOptions:
+    """Errors of the autopilot's estimates; GM: a first-order Gauss-Markov process of that sigma."""
+
+    gnss_sigma_m: float = option(2.0, "horizontal position, GM [m]", minimum=0, maximum=100)
+    gnss_tau_s: float = option(60.0, "its time constant [s]", minimum=0.1, maximum=1e5)
+    position_noise_m: float = option(0.05, "white noise of a position [m]", minimum=0, maximum=100)
+    height_bias_m: float = option(1.5, "constant height error, one sigma over seeds [m]", minimum=0, maximum=100)
+    baro_walk_m: float = option(0.3, "random walk of the height, one sigma after a minute [m]", minimum=0, maximum=100)
+    tilt_sigma_deg: float = option(0.5, "roll and pitch, GM with tau 8 s [deg]", minimum=0, maximum=45)
+    heading_sigma_deg: float = option(1.0, "heading, GM with tau 8 s [deg]", minimum=0, maximum=90)
+    compass_bias_deg: float = option(
+        8.0,
+        "amplitude of the compass error that turns with heading [deg]; with 0.3 of it twice per turn",
+        minimum=0,
+        maximum=90,
+    )
+    compass_offset_deg: float = option(1.5, "constant heading error [deg]", minimum=-180, maximum=180)
+    gyro_noise_deg_s: float = option(0.15, "white noise of a rate, one sigma [deg/s]", minimum=0, maximum=50)
+    gyro_bias_deg_s: float = option(
+        0.3, "constant error of each rate, one sigma over seeds [deg/s]", minimum=0, maximum=50
+    )
+    gyro_filter_hz: float = option(20.0, "low-pass of the gyros [Hz]; takes vibration away", minimum=0.1, maximum=1000)
+    gyro_delay_s: float = option(
+        0.0, "delay of that filter: states are this much older than stamped [s]", minimum=0, maximum=1
+    )
+    accel_noise_m_s2: float = option(0.3, "white noise of a specific force, one sigma [m/s^2]", minimum=0, maximum=50)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkOptions:
+    """The autopilot's MAVLink: version, rates, latency."""
+
+    version: int = option(1, "MAVLink version", choices=(1, 2))
+    firmware: str = option(
+        "3.1.3", "3.1.3: 50 Hz ticks, 25 Hz at most; modern: rates as asked", choices=("3.1.3", "modern")
+    )
+    raw_sensors_hz: float = option(50.0, "rate asked for RAW_IMU, SCALED_PRESSURE", minimum=0, maximum=1000)
+    extra1_hz: float = option(50.0, "rate asked for ATTITUDE", minimum=0, maximum=1000)
+    position_hz: float = option(10.0, "rate asked for GLOBAL_POSITION_INT", minimum=0, maximum=1000)
+    status_hz: float = option(4.0, "rate asked for GPS_RAW_INT, SYS_STATUS", minimum=0, maximum=1000)
+    extra2_hz: float = option(4.0, "rate asked for VFR_HUD", minimum=0, maximum=1000)
+    extra3_hz: float = option(2.0, "rate asked for SYSTEM_TIME", minimum=0, maximum=1000)
+    system_time: str = option(
+        "exact",
+        "unix time in SYSTEM_TIME: exact, or that of the last GPS epoch as 3.1.3 sends",
+        choices=("exact", "epoch"),
+    )
+    stamp_jitter_s: float = option(
+        0.005,
+        "a message's state is older or younger than its stamp by up to [s], uniform about zero",
+        minimum=0,
+        maximum=1,
+    )
+    latency_s: float = option(0.012, "shortest time from building to receiving [s]", minimum=0, maximum=10)
+    latency_jitter_s: float = option(0.006, "mean of what comes on top, exponential [s]", minimum=0, maximum=10)
+
+
+@dataclass(frozen=True, slots=True)
+class MountOptions:
+    """How the true mount differs from the nominal one that is written into the log."""
+
+    boresight_deg: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), "true minus nominal yaw, pitch, roll of the lidar [deg]", minimum=-20, maximum=20
+    )
+    lever_m: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), "true minus nominal lever arm: right, forward, up [m]", minimum=-1, maximum=1
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FaultOptions:
+    """What goes wrong in flight; a time of 0 s: it does not."""
+
+    reboot_at_s: float = option(0.0, "the INS reboots at [s]", minimum=0, maximum=1e6)
+    reboot_silence_s: float = option(6.0, "and is silent for [s]", minimum=0, maximum=1e4)
+    lidar_gap_at_s: float = option(0.0, "lidar packets get lost from [s]", minimum=0, maximum=1e6)
+    lidar_gap_s: float = option(0.5, "for [s]", minimum=0, maximum=1e4)
+    garbage_per_s: float = option(0.0, "bursts of line noise on the MAVLink bytes [1/s]", minimum=0, maximum=100)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """All options of a simulation."""
+
+    lidar: LidarOptions = option(LidarOptions, "beams and rotor")
+    gyros: GyroOptions = option(GyroOptions, "gyros and accelerometers inside the lidar")
+    clocks: ClockOptions = option(ClockOptions, "clocks")
+    flight: FlightOptions = option(FlightOptions, "motion beyond the route")
+    ins: InsOptions = option(InsOptions, "errors of the autopilot's estimates")
+    link: LinkOptions = option(LinkOptions, "MAVLink link")
+    mount: MountOptions = option(MountOptions, "true mount against nominal")
+    faults: FaultOptions = option(FaultOptions, "what goes wrong")
+    truth_hz: float = option(500.0, "rate of truth.csv [Hz]", minimum=100, maximum=2000)
+    capture_resolution: str = option("us", "resolution of the pcap's stamps", choices=("us", "ns"))
+
+
+def perfect(options: Options) -> Options:
+    """The same world with perfect instruments: no error, noise, jitter or vibration; clocks keep offset and drift."""
+    lidar = dataclasses.replace(
+        options.lidar, range_noise_m=0.0, laser_bias_m=0.0, intensity_noise=0.0, encoder_noise_deg=0.0
+    )
+    gyros = GyroOptions(
+        offset_deg_s=(0.0, 0.0, 0.0), noise_deg_s=0.0, rotor_line_deg_s=0.0, accel_noise_g=0.0, accel_rotor_line_g=0.0
+    )
+    zeros = {
+        field.name: 0.0
+        for field in dataclasses.fields(InsOptions)
+        if field.name not in ("gnss_tau_s", "gyro_filter_hz")
+    }
+    return dataclasses.replace(
+        options,
+        lidar=lidar,
+        gyros=gyros,
+        clocks=dataclasses.replace(options.clocks, arrival_jitter_us=0.0),
+        flight=dataclasses.replace(options.flight, vibration_deg=0.0),
+        ins=dataclasses.replace(options.ins, **zeros),
+        link=dataclasses.replace(options.link, stamp_jitter_s=0.0, latency_jitter_s=0.0),
+        mount=MountOptions(),
+        faults=FaultOptions(),
+    )

@@ -1,0 +1,57 @@
+"""What goes wrong in flight: the INS reboots, packets get lost, the serial line picks up noise."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.constants import NS_PER_S
+from simulator.clocks import Clock
+from simulator.config import FaultOptions
+
+_FIRST_STAMP_NS: Final = 2_500_000_000
+"""What the boot clock shows when the first message after a reboot is built."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reboot:
+    """A reboot of the INS: silence from `start_s` to `end_s`, then another boot clock; never if start is 0."""
+
+    start_s: float
+    end_s: float
+
+    @classmethod
+    def of(cls, options: FaultOptions) -> "Reboot":
+        """The reboot of a configuration."""
+        return cls(options.reboot_at_s, options.reboot_at_s + options.reboot_silence_s)
+
+    def silent(self, time_s: float) -> bool:
+        """Whether nothing is sent at a true time."""
+        return self.start_s > 0 and self.start_s <= time_s < self.end_s
+
+    def after(self, time_s: float) -> bool:
+        """Whether a true time lies after the reboot."""
+        return self.start_s > 0 and time_s >= self.end_s
+
+    def clock(self, time_s: float, first: Clock) -> Clock:
+        """The boot clock in force at a true time."""
+        if not self.after(time_s):
+            return first
+        elapsed_ns = round(self.end_s * NS_PER_S * (1.0 + first.drift_ppm * 1e-6))
+        return Clock(_FIRST_STAMP_NS - elapsed_ns, first.drift_ppm)
+
+
+def arriving(sent_s: npt.NDArray[np.float64], options: FaultOptions) -> npt.NDArray[np.bool_]:
+    """Which lidar packets are not lost, shape (n,)."""
+    if options.lidar_gap_at_s <= 0:
+        return np.ones(len(sent_s), np.bool_)
+    lost = (sent_s >= options.lidar_gap_at_s) & (sent_s < options.lidar_gap_at_s + options.lidar_gap_s)
+    return np.asarray(~lost)
+
+
+def garbage_before(rng: np.random.Generator, chance: float) -> bytes:
+    """Line noise ahead of a frame: nothing, or with a chance 1 to 40 random bytes."""
+    if chance <= 0 or rng.random() >= chance:
+        return b""
+    return bytes(rng.integers(0, 256, int(rng.integers(1, 41)), dtype=np.uint8))

@@ -1,0 +1,200 @@
+"""The named scenes: what stands where, where to fly, and how the lidar is mounted for it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.errors import UsageError
+from flightlog.mount import LidarMount, Mount
+from simulator.buildings import (
+    Windows,
+    add_car,
+    add_house,
+    add_panel,
+    add_shelter,
+    add_tree,
+    add_wall,
+)
+from simulator.chance import generator
+from simulator.meshes import box, catenary, height_grid, prism, quad
+from simulator.parts import Parts, World
+from simulator.route import Route
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A world, a route through it, and the nominal mount."""
+
+    name: str
+    world: World
+    route: Route
+    mount: Mount = field(default_factory=Mount)
+
+
+def ground_height(x_m: Array, y_m: Array) -> Array:
+    """Relief of the undulating ground: 12 cm over 20 m and 5 cm over 7 m, flat at 0 round the house; shape as given [m]."""
+    relief = 0.12 * np.sin(2 * np.pi * x_m / 20.0 + 0.4) * np.cos(2 * np.pi * y_m / 23.0)
+    relief += 0.05 * np.sin(2 * np.pi * (x_m + 0.6 * y_m) / 7.0)
+    outside_m = np.maximum(np.abs(x_m) - 22.0, np.abs(y_m) - 8.0)
+    return np.asarray(relief * np.clip(outside_m / 4.0, 0.0, 1.0))
+
+
+def _add_ground(parts: Parts, half_m: float, step_m: float, rng: np.random.Generator, grass_m: float = 0.015) -> None:
+    """Undulating grass with a street of asphalt, and bare soil far out."""
+    axis = np.arange(-half_m, half_m + step_m / 2, step_m)
+    x, y = np.meshgrid(axis, axis)
+    z = ground_height(x, y) + rng.normal(scale=grass_m, size=x.shape)
+    street = np.abs(y + 21.0) < 3.0
+    z[street] = -0.12
+    triangles = height_grid(axis, axis, z)
+    middle = triangles.mean(axis=1)
+    on_street = np.abs(middle[:, 1] + 21.0) < 3.0 - step_m
+    parts.add("grass", "grass", triangles[~on_street])
+    parts.add("street", "asphalt", triangles[on_street])
+    far_m = 300.0
+    for west, south, east, north in (
+        (-far_m, -far_m, far_m, -half_m),
+        (-far_m, half_m, far_m, far_m),
+        (-far_m, -half_m, -half_m, half_m),
+        (half_m, -half_m, far_m, half_m),
+    ):
+        parts.add("far ground", "soil", quad((west, south, -0.2), (east - west, 0, 0), (0, north - south, 0)))
+
+
+def _on_ground(x_m: float, y_m: float) -> Array:
+    return np.array([x_m, y_m, float(ground_height(np.array(x_m), np.array(y_m))) - 0.03])
+
+
+def _add_power_line(parts: Parts) -> None:
+    posts = [np.array([x, -30.0, 0.0]) for x in (-75.0, -37.5, 0.0, 37.5, 75.0)]
+    for i, at in enumerate(posts):
+        parts.add(f"pole {i}", "wood", prism(at - np.array([0, 0, 0.5]), at + np.array([0, 0, 8.0]), 0.12, 8))
+        parts.add(f"pole {i}", "wood", box(at + np.array([-0.06, -1.2, 7.6]), at + np.array([0.06, 1.2, 7.72])))
+    for i in range(len(posts) - 1):
+        for offset in (-1.1, 0.0, 1.1):
+            hang = np.array([0.0, offset, 7.75])
+            parts.add("wires", "wire", catenary(posts[i] + hang, posts[i + 1] + hang, 0.7, 0.009))
+
+
+def _add_reference_panels(parts: Parts) -> None:
+    for i, material in enumerate(("panel_4.6", "panel_30.3", "panel_81.3")):
+        at = np.array([-26.0 + 2.0 * i, -17.0, 0.25])
+        parts.add(f"{material} flat", material, quad(at - [0.5, 0.5, 0], (1, 0, 0), (0, 1, 0)))
+        add_panel(parts, f"{material} upright", material, np.array([30.0 + 2.0 * i, 16.0, 0.9]), 200.0)
+
+
+def village(rng: np.random.Generator) -> tuple[World, Route]:
+    """A long house with recessed windows, garage, shed, bicycle shelter, trees, poles, wires, cars, on undulating ground."""
+    parts = Parts()
+    _add_ground(parts, 90.0, 0.5, rng)
+    add_house(parts, "house", (40.0, 12.0), 6.0, 9.0, Windows(9, 2))
+    parts.add("balcony", "concrete", box((-4.0, -7.4, 2.9), (4.0, -6.0, 3.05)))
+    parts.add("canopy", "wood", box((10.0, 6.0, 2.5), (14.0, 7.6, 2.6)))
+    parts.add("garage", "brick", box((26, -8, -0.2), (32, 0, 2.8)))
+    parts.add("shed", "wood", box((-34, 6, -0.2), (-30, 9, 2.3)))
+    add_shelter(parts, "shelter", np.array([-8.0, -13.5, -0.1]), 0.0)
+    spots = [(-38, -12), (-44, 4), (-30, 20), (-18, 24), (-4, 19), (8, 26), (20, 19), (33, 24), (42, 8), (40, -10)]
+    for i, (x, y) in enumerate([*spots, (-55, -14), (14, -38), (-20, -36), (55, 20)]):
+        shift = rng.uniform(-1.5, 1.5, 2)
+        add_tree(parts, f"tree {i}", _on_ground(x + shift[0], y + shift[1]), rng.uniform(5.0, 10.0), rng)
+    for i, at_m in enumerate(np.linspace(-36, 36, 7)):
+        add_car(parts, f"car {i}", np.array([at_m + rng.uniform(-2, 2), -22.5, -0.12]), 90 + rng.uniform(-4, 4))
+    _add_power_line(parts)
+    _add_reference_panels(parts)
+    for post_m in np.arange(-24.0, 24.1, 2.0):
+        parts.add("fence", "wood", prism((post_m, 15.0, -0.4), (post_m, 15.0, 1.1), 0.04, 4))
+    for rail_m in (0.4, 1.0):
+        parts.add("fence", "wood", prism((-24, 15, rail_m), (24, 15, rail_m), 0.03, 4))
+    high = [5.4 + 4.0 * float(share) for share in rng.random(8)]
+    route = Route(
+        points_m=(
+            (-24.0, -12.0, 3.0),
+            (-14.0, -15.5, high[0]),
+            (4.0, -14.0, high[1]),
+            (27.0, -13.5, high[2]),
+            (37.0, 2.0, high[3]),
+            (22.0, 12.0, high[4]),
+            (0.0, 11.5, high[5]),
+            (-24.0, 12.5, high[6]),
+            (-36.0, -2.0, high[7]),
+            (-27.0, -12.0, high[0]),
+        ),
+        speed_m_s=4.4,
+    )
+    return parts.world(), route
+
+
+def field_scene(rng: np.random.Generator) -> tuple[World, Route]:
+    """Flat level ground at height 0 and one plain wall that looks south: for tests of geometry. Flown in lines."""
+    parts = Parts()
+    parts.add("ground", "grass", quad((-400, -400, 0), (800, 0, 0), (0, 800, 0)))
+    wall = (np.array([-30.0, 20.0, 0.0]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0]))
+    add_wall(parts, "wall", wall, (60.0, 8.0), None)
+    lines = [(-20.0, -15.0), (20.0, -15.0), (20.0, -5.0), (-20.0, -5.0), (-20.0, 5.0), (20.0, 5.0)]
+    points = [(x, y, 10.0 + rng.uniform(-1, 1)) for x, y in lines]
+    return parts.world(), Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0)
+
+
+def facade(rng: np.random.Generator) -> tuple[World, Route]:
+    """A street between long facades at 30 m, driven by a car at 6 m/s."""
+    parts = Parts()
+    parts.add("street", "asphalt", quad((-250, -12, 0), (500, 0, 0), (0, 20, 0)))
+    parts.add("lawn", "grass", quad((-250, 8, 0.0), (500, 0, 0), (0, 92, 0)))
+    parts.add("lawn", "grass", quad((-250, -100, 0.0), (500, 0, 0), (0, 88, 0)))
+    for i, x in enumerate(np.arange(-200.0, 120.1, 80.0 + 15.0)):
+        wall = (np.array([x, 30.0, 0.0]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0]))
+        add_wall(parts, f"facade {i}", wall, (80.0, 12.0), Windows(20, 4))
+        across = (np.array([x + 80.0, -38.0, 0.0]), np.array([-1.0, 0, 0]), np.array([0, 1.0, 0]))
+        add_wall(parts, f"facade {i} across", across, (80.0, 9.0), Windows(16, 3))
+    for i, x in enumerate(np.arange(-190.0, 190.0, 24.0)):
+        add_tree(parts, f"tree {i}", np.array([x + rng.uniform(-4, 4), 12.0, 0.0]), rng.uniform(5, 9), rng)
+        add_car(parts, f"car {i}", np.array([x + rng.uniform(-6, 6), 6.5, 0.0]), 90.0)
+        at = np.array([x + 12.0, 9.5, 0.0])
+        parts.add("lamps", "metal", prism(at, at + np.array([0, 0, 6.0]), 0.06, 8))
+    points = ((-150.0, 0.0, 2.1), (150.0, 0.0, 2.1), (158.0, -4.0, 2.1), (150.0, -8.0, 2.1), (-150.0, -8.0, 2.1))
+    route = Route(points_m=(*points, (-158.0, -4.0, 2.1)), speed_m_s=6.0, loop_from=0, kind="car")
+    return parts.world(), route
+
+
+def panels(rng: np.random.Generator) -> tuple[World, Route]:
+    """Reference panels of 1 m2 at 5 to 60 m around a tripod: the sensor verification of the source's appendix B."""
+    parts = Parts()
+    parts.add("ground", "grass", quad((-300, -300, 0), (600, 0, 0), (0, 600, 0)))
+    distances = np.arange(5.0, 60.1, 5.0)
+    headings = np.linspace(-95.0, 95.0, 36)
+    order = rng.permutation(36)
+    for i, slot in enumerate(order):
+        material = ("panel_4.6", "panel_30.3", "panel_81.3")[i % 3]
+        distance, heading = distances[i // 3], np.radians(headings[slot])
+        at = np.array([distance * np.sin(heading), distance * np.cos(heading), 1.5])
+        add_panel(parts, f"{material} at {distance:.0f} m", material, at, headings[slot] + 180.0)
+    return parts.world(), Route(points_m=((0.0, 0.0, 1.5),), heading_deg=0.0, kind="tripod")
+
+
+_LEVEL: Final = Mount(lidar=LidarMount(position_m=(0.0, 0.0, 0.0), pitch_deg=0.0))
+SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], tuple[World, Route]], Mount]]] = {
+    "village": (village, Mount()),
+    "field": (field_scene, Mount()),
+    "facade": (facade, Mount()),
+    "panels": (panels, _LEVEL),
+}
+
+
+def scene(name: str, seed: int) -> Scene:
+    """Build a scene by name; the seed places what is not fixed.
+
+    Raises
+    ------
+    UsageError
+        No such scene.
+    """
+    if name not in SCENES:
+        raise UsageError(f"scene {name!r} is not known; known are {', '.join(SCENES)}")
+    build, mount = SCENES[name]
+    world, route = build(generator(seed, f"scene {name}"))
+    return Scene(name, world, route, mount)
