@@ -5,7 +5,7 @@ position samples, 200 a second, are given whole.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from flightlog import clock, hdl32e, records
 from flightlog.constants import NS_PER_S, NS_PER_US, STANDARD_GRAVITY_M_S2
-from flightlog.logfile import LogReader
+from flightlog.logfile import LogReader, Message
 from flightlog.mavlink import Frame, FrameParser
 from flightlog.records import LidarAccount
 
@@ -157,42 +157,45 @@ def first_stamp(readers: Sequence[LogReader]) -> DeviceClock:
 
 def lidar_batches(readers: Sequence[LogReader], progress: Progress | None = None) -> Iterator[LidarBatch]:
     """Stream the lidar packets of one or several logs, each message with its account."""
-    device = first_stamp(readers)
-    topics = (records.LIDAR.topic, records.LIDAR_ACCOUNT.topic)
+    joiner = BatchJoiner(first_stamp(readers))
     for reader in in_order(readers):
-        pending = _Pending()
-        for message in reader.messages(topics, progress):
-            if message.log_time_ns != pending.log_time_ns:
-                if pending.filled:
-                    yield pending.batch(device)
-                pending = _Pending(message.log_time_ns)
-            if message.topic == records.LIDAR.topic:
-                pending.packets.append(records.decode_scan(message.data))
-            else:
-                pending.account = records.decode_account(message.data)
-        if pending.filled:
-            yield pending.batch(device)
+        for message in reader.messages(BatchJoiner.TOPICS, progress):
+            yield from joiner.feed(message)
+        yield from joiner.finish()
 
 
-@dataclass(slots=True)
-class _Pending:
-    """A batch of which packets and account, one log time, may come in either order."""
+class BatchJoiner:
+    """Joins packets and account, two messages of one log time that may come in either order."""
 
-    log_time_ns: int = -1
-    packets: list[npt.NDArray[np.void]] = field(default_factory=list)
-    account: LidarAccount | None = None
+    TOPICS: Final = (records.LIDAR.topic, records.LIDAR_ACCOUNT.topic)
 
-    @property
-    def filled(self) -> bool:
-        return bool(self.packets) or self.account is not None
+    def __init__(self, device: DeviceClock) -> None:
+        self.device = device
+        self._log_time_ns = -1
+        self._packets: list[npt.NDArray[np.void]] = []
+        self._account: LidarAccount | None = None
 
-    def batch(self, device: DeviceClock) -> LidarBatch:
-        packets = np.concatenate([np.empty(0, records.SCAN_PACKET_DTYPE), *self.packets])
+    def feed(self, message: Message) -> list[LidarBatch]:
+        """Take a message of TOPICS; give the batch before it, when it is complete."""
+        done = self.finish() if message.log_time_ns != self._log_time_ns else []
+        self._log_time_ns = message.log_time_ns
+        if message.topic == records.LIDAR.topic:
+            self._packets.append(records.decode_scan(message.data))
+        else:
+            self._account = records.decode_account(message.data)
+        return done
+
+    def finish(self) -> list[LidarBatch]:
+        """Give the last batch."""
+        if not self._packets and self._account is None:
+            return []
+        packets = np.concatenate([np.empty(0, records.SCAN_PACKET_DTYPE), *self._packets])
+        account, self._packets, self._account = self._account, [], None
         receive_ns = records.receive_time_ns(packets)
         if not len(packets):
-            return LidarBatch(self.log_time_ns, packets, receive_ns, receive_ns, self.account)
-        device_ns, jumped = device.extend(packets["data"]["stamp_us"], receive_ns)
-        return LidarBatch(self.log_time_ns, packets, receive_ns, device_ns, self.account, jumped)
+            return [LidarBatch(self._log_time_ns, packets, receive_ns, receive_ns, account)]
+        device_ns, jumped = self.device.extend(packets["data"]["stamp_us"], receive_ns)
+        return [LidarBatch(self._log_time_ns, packets, receive_ns, device_ns, account, jumped)]
 
 
 def position_samples(readers: Sequence[LogReader], progress: Progress | None = None) -> PositionSamples:
@@ -282,7 +285,6 @@ def mavlink_frames(
         To look at its counters afterwards.
     progress : callable, optional
         Called with the number of file bytes done since the last call.
-
     """
     parser = FrameParser() if parser is None else parser
     for reader in in_order(readers):

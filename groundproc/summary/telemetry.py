@@ -1,0 +1,154 @@
+"""A MAVLink link in figures: what came from whom at what rate, what was lost, and how often the autopilot started anew."""
+
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Final
+
+from flightlog import clock
+from flightlog.constants import NS_PER_S
+from flightlog.mavlink import AUTOPILOT_INVALID, Frame, message_id, payload_dtype
+
+_WRAP_MS: Final = 1 << 32
+_REBOOT_MS: Final = 10_000
+"""A boot time this much below the last one is a new boot; messages that overtake each other differ by less."""
+_REORDERED: Final = 128
+_HEARTBEAT: Final = message_id("HEARTBEAT")
+_SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
+_GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
+_BOOT_TIMED: Final = tuple(message_id(name) for name in ("SYSTEM_TIME", "ATTITUDE", "GLOBAL_POSITION_INT"))
+
+
+@dataclass(slots=True)
+class _Kind:
+    """Messages of one kind from one component."""
+
+    name: str
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+
+@dataclass(slots=True)
+class _Boot:
+    """One run of an autopilot, from power-on or from where the recording begins."""
+
+    first_ns: int
+    first_ms: int
+    last_ns: int
+    last_ms: int
+
+
+@dataclass(slots=True)
+class _Node:
+    """One component of one system."""
+
+    is_autopilot: bool = False
+    kinds: dict[int, _Kind] = field(default_factory=dict)
+    sequence: int | None = None
+    lost: int = 0
+    boots: list[_Boot] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class TelemetrySummary:
+    """Sums over all frames of a link; `result` turns them into figures."""
+
+    frames: int = 0
+    nodes: dict[tuple[int, int], _Node] = field(default_factory=dict)
+    first_utc_ns: int | None = None
+    fix_type: int | None = None
+    satellites: int | None = None
+
+    def add(self, frame: Frame) -> None:
+        """Take the next frame; one outside the dialect counts nothing, its sender is not proven."""
+        if not frame.known:
+            return
+        self.frames += 1
+        node = self.nodes.setdefault((frame.system, frame.component), _Node())
+        kind = node.kinds.setdefault(frame.message_id, _Kind(frame.name, 0, frame.time_ns))
+        kind.count += 1
+        kind.last_ns = frame.time_ns
+        if node.sequence is not None:
+            skipped = (frame.sequence - node.sequence - 1) % 256
+            node.lost += skipped if skipped < _REORDERED else 0
+        node.sequence = frame.sequence
+        if frame.message_id == _HEARTBEAT:
+            node.is_autopilot |= _value(frame, "autopilot") != AUTOPILOT_INVALID
+        elif frame.message_id == _GPS_RAW_INT:
+            self.fix_type = max(self.fix_type or 0, _value(frame, "fix_type"))
+            self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
+        if frame.message_id in _BOOT_TIMED:
+            _boot(node, frame.time_ns, _value(frame, "time_boot_ms"))
+        if frame.message_id == _SYSTEM_TIME and self.first_utc_ns is None:
+            self.first_utc_ns = _value(frame, "time_unix_usec") * 1000 or None
+
+    def result(self, bad_bytes: int, unknown: int) -> dict[str, Any]:
+        """The figures; see `swath info --json`."""
+        autopilots = {key: node for key, node in self.nodes.items() if node.is_autopilot}
+        return {
+            "frames": self.frames,
+            "unknown_frames": unknown,
+            "bad_bytes": bad_bytes,
+            "lost_frames": sum(node.lost for node in autopilots.values()),
+            "autopilots": [_autopilot(key, node) for key, node in autopilots.items()],
+            "reboots": sum(max(len(node.boots) - 1, 0) for node in autopilots.values()),
+            "gps_fix_type": self.fix_type,
+            "gps_satellites": self.satellites,
+            "first_system_time_utc": clock.utc_text(self.first_utc_ns) if self.first_utc_ns else None,
+            "messages": [
+                _kind(key, kind)
+                for key, node in sorted(self.nodes.items())
+                for kind in sorted(node.kinds.values(), key=lambda kind: (-kind.count, kind.name))
+            ],
+        }
+
+
+def _boot(node: _Node, time_ns: int, boot_ms: int) -> None:
+    last = node.boots[-1] if node.boots else None
+    if last is None or (last.last_ms - boot_ms > _REBOOT_MS and last.last_ms - boot_ms < _WRAP_MS - _REBOOT_MS):
+        node.boots.append(_Boot(time_ns, boot_ms, time_ns, boot_ms))
+        return
+    last.last_ns, last.last_ms = time_ns, boot_ms
+
+
+def _autopilot(key: tuple[int, int], node: _Node) -> dict[str, Any]:
+    return {
+        "system": key[0],
+        "component": key[1],
+        "lost_frames": node.lost,
+        "boots": [
+            {
+                "from_utc": clock.utc_text(boot.first_ns),
+                "to_utc": clock.utc_text(boot.last_ns),
+                "from_boot_s": boot.first_ms / 1000,
+                "to_boot_s": boot.last_ms / 1000,
+            }
+            for boot in node.boots
+        ],
+    }
+
+
+def _kind(key: tuple[int, int], kind: _Kind) -> dict[str, Any]:
+    duration_s = (kind.last_ns - kind.first_ns) / NS_PER_S
+    return {
+        "system": key[0],
+        "component": key[1],
+        "name": kind.name,
+        "count": kind.count,
+        "rate_hz": round((kind.count - 1) / duration_s, 3) if duration_s > 0 else None,
+    }
+
+
+@cache
+def _place(number: int, name: str) -> tuple[int, int]:
+    """Offset and size of an integer field in a message's payload."""
+    fields = payload_dtype(number).fields
+    assert fields is not None
+    dtype, offset = fields[name][:2]
+    return int(offset), int(dtype.itemsize)
+
+
+def _value(frame: Frame, name: str) -> int:
+    """An unsigned field of a message; version 2 cuts trailing zeros."""
+    offset, size = _place(frame.message_id, name)
+    return int.from_bytes(frame.payload[offset : offset + size], "little")

@@ -1,0 +1,114 @@
+"""The figures of a log as text for a pilot."""
+
+from collections.abc import Iterator
+from typing import Any
+
+
+def as_text(summary: dict[str, Any]) -> str:
+    """Lines of text for what `summary.log.summarise` gives."""
+    lines = [f"{summary['file']}: {_size(summary['bytes'])}, {summary['duration_s']} s"]
+    lines += _section("log", _log(summary))
+    if summary["lidar"] is not None:
+        lines += _section("lidar", _lidar(summary))
+    if summary["position"] is not None:
+        lines += _section("position packets", _position(summary["position"]))
+    for link, mavlink in summary["mavlink"].items():
+        lines += _section(f"mavlink {link}", _mavlink(mavlink))
+    if summary["gap_count"]:
+        lines += _section(f"gaps of more than a second: {summary['gap_count']}", _gaps(summary))
+    return "\n".join(lines)
+
+
+def _section(title: str, rows: Iterator[tuple[str, str]]) -> list[str]:
+    return ["", title, *(f"  {name:<22}{text}" for name, text in rows)]
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count} bytes"
+
+
+def _log(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    if summary["start_utc"]:
+        yield "recorded", f"{summary['start_utc']} to {summary['end_utc']} by the recording computer"
+    yield "made by", summary["session"].get("software", "unknown")
+    damage = summary["damage"]
+    state = "cut off: the recorder did not finish it" if summary["truncated"] else "whole"
+    if damage["bad_chunks"] or damage["lost_bytes"]:
+        state += f"; {damage['bad_chunks']} damaged pieces, {damage['lost_bytes']} bytes lost"
+    yield "state", state
+    for place in damage["places"]:
+        yield "", place
+    if summary["attachments"]:
+        yield "attached", ", ".join(summary["attachments"])
+    for name, topic in summary["topics"].items():
+        rate = "" if topic["rate_hz"] is None else f", {topic['rate_hz']:.1f} a second"
+        yield name, f"{topic['messages']} messages{rate}, {_size(topic['bytes'])}"
+    for key, what in (
+        ("messages_backwards", "messages are out of the order of time"),
+        ("messages_damaged", "messages cannot be read"),
+        ("host_clock_steps", "times was the recording computer's clock set"),
+    ):
+        if summary[key]:
+            yield "", f"{summary[key]} {what}"
+
+
+def _lidar(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    lidar = summary["lidar"]
+    yield "packets", f"{lidar['packets']}, {lidar['shots_with_return']} shots with a return"
+    yield "return mode", str(lidar["return_mode"] or "unknown")
+    if lidar["rpm"] is not None:
+        yield "rotation", f"{lidar['rpm']:.1f} rpm (spread {lidar['rpm_spread']:.1f}), {lidar['turns']:.1f} turns"
+    yield "azimuths seen", f"{lidar['azimuth_coverage_deg']} deg of 360"
+    if lidar["window_aboard_deg"]:
+        yield "window aboard", "{:.1f} to {:.1f} deg, clockwise".format(*lidar["window_aboard_deg"])
+    if lidar["sensor_fov_deg"]:
+        yield "the sensor's own", "{:.1f} to {:.1f} deg, clockwise".format(*lidar["sensor_fov_deg"])
+    yield "lost packets", str(lidar["lost_packets"])
+    aboard, sensor = lidar["missing_outside_window_aboard"], lidar["missing_outside_sensor_fov"]
+    yield "not wanted", f"{aboard} outside the window aboard, {sensor} outside the sensor's own"
+    account = lidar["account"] or {}
+    counted = {name: account[name] for name in account if account[name] and name not in ("received", "kept")}
+    if counted:
+        yield "counted aboard", ", ".join(f"{name} {count}" for name, count in counted.items())
+    clock = lidar["clock"]
+    if clock is not None:
+        rate = f"{clock['drift_ppm']:+.2f} +- {clock['drift_sigma_ppm']:.2f} ppm against the recording computer's"
+        yield "clock", f"{rate}, jitter {clock['jitter_us']:.0f} us, set {clock['jumps']} times"
+
+
+def _position(position: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    rate = "" if position["rate_hz"] is None else f", {position['rate_hz']:.1f} a second"
+    yield "packets", f"{position['packets']}{rate}, {position['with_imu']} with inertial readings"
+    yield "pulse (PPS)", ", ".join(f"{name} in {count}" for name, count in position["pps"].items()) or "unknown"
+    gps = position["gps"]
+    yield "GPS sentences", f"{gps['sentences']}, {gps['valid']} with a fix, {gps['unreadable']} unreadable"
+    if gps["first_fix"]:
+        fix = gps["first_fix"]
+        yield "first fix", f"{fix['utc']} at {fix['latitude_deg']}, {fix['longitude_deg']}"
+    lag = "" if gps["lag_s"] is None else f" (a sentence appears {gps['lag_s']} s after its second began)"
+    yield "lidar clock", position["clock_state"] + lag
+
+
+def _mavlink(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "frames", f"{mavlink['frames']}, {mavlink['unknown_frames']} of unknown kind"
+    yield "bad bytes", str(mavlink["bad_bytes"])
+    for autopilot in mavlink["autopilots"]:
+        name = f"autopilot {autopilot['system']}/{autopilot['component']}"
+        yield name, f"{len(autopilot['boots'])} boots, {autopilot['lost_frames']} frames lost on the way"
+        for boot in autopilot["boots"]:
+            since = f"{boot['from_boot_s']:.1f} to {boot['to_boot_s']:.1f} s since boot"
+            yield "", f"{boot['from_utc']} to {boot['to_utc']}: {since}"
+    if mavlink["gps_fix_type"] is not None:
+        yield "GPS", f"best fix type {mavlink['gps_fix_type']}, {mavlink['gps_satellites']} satellites at most"
+    if mavlink["first_system_time_utc"]:
+        yield "autopilot's UTC", f"known, first {mavlink['first_system_time_utc']}"
+    for kind in mavlink["messages"]:
+        rate = "" if kind["rate_hz"] is None else f"{kind['rate_hz']:8.2f} a second"
+        yield f"{kind['system']}/{kind['component']} {kind['name']}".ljust(38), f"{kind['count']:8d} {rate}"
+
+
+def _gaps(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for gap in summary["gaps"]:
+        yield gap["topic"], f"{gap['duration_s']:.1f} s from {gap['from_utc']}"
+    if summary["gap_count"] > len(summary["gaps"]):
+        yield "", "and more"
