@@ -27,7 +27,6 @@ from onboard.worker import Worker
 _log = logging.getLogger(__name__)
 
 _STATUS_S: Final = 1.0
-_TICK_S: Final = 0.1
 
 
 class Daemon:
@@ -137,13 +136,8 @@ class Daemon:
     def _attend(self) -> None:
         """Clocks, status and watchdog, once a second, until asked to stop or a worker died."""
         is_ready = False
-        next_ns = 0
         while not self._stop.is_set() and not self._failures():
             now_ns = time.monotonic_ns()
-            if now_ns < next_ns:
-                self._stop.wait(_TICK_S)
-                continue
-            next_ns = now_ns + round(_STATUS_S * NS_PER_S)
             clock = self._clock_watch.record()
             if abs(clock.step_ns) > NS_PER_S:
                 _log.warning("the wall clock was set by %.3f s; log time goes on evenly", clock.step_ns / NS_PER_S)
@@ -154,6 +148,7 @@ class Daemon:
                 notify.ready(health.summary(status))
                 is_ready = True
             self._stroke(status, now_ns)
+            self._stop.wait(_STATUS_S)
 
     def _stroke(self, status: Status, now_ns: int) -> None:
         """Tell systemd that all is well, if it is."""

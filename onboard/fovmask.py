@@ -63,7 +63,8 @@ def apply(packets: npt.NDArray[np.void], window: Window) -> Masked:
         return Masked(packets, 0, 0)
     inside = blocks_inside(packets["data"]["blocks"]["azimuth"], packets["data"]["return_mode"], window)
     stays = inside.any(axis=1)
-    kept = packets[stays]
+    # As opaque bytes: numpy copies a structure field by field, forty times slower.
+    kept = packets.view(f"V{packets.dtype.itemsize}")[stays].view(packets.dtype)
     packet, block = np.nonzero(~inside[stays])
     if len(packet):
         ranges = kept["data"]["blocks"]["returns"]["range"]

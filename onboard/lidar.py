@@ -2,6 +2,7 @@
 
 import logging
 import socket
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import hdl32e, records
-from flightlog.constants import NS_PER_MS
+from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.records import SCAN_PACKET_DTYPE, LidarAccount
 from onboard import fovmask
 from onboard.config import LidarConfig
@@ -25,6 +26,11 @@ _log = logging.getLogger(__name__)
 BATCH_NS: Final = 100 * NS_PER_MS
 """A message of the log spans about this much."""
 _DATA_SLOTS: Final = 512
+_SMALL_BUFFER_BYTES: Final = 1 << 20
+_SMALL_BUFFER_POLL_S: Final = 0.02
+"""Debian's default buffer holds 50 ms of packets."""
+_BUSY_POLL_S: Final = 0.005
+"""After a poll that filled all slots: packets come so fast that the usual pause would eat up the buffer."""
 _POSITION_SLOTS: Final = 128
 
 Put = Callable[[str, int, bytes, bool], bool]
@@ -75,7 +81,7 @@ class LidarPort(Worker):
         super().__init__("lidar")
         self.counts = LidarCounts()
         self.window = Window.from_degrees(config.fov.start_deg, config.fov.end_deg)
-        self._put, self._poll_s = put, config.poll_ms / 1e3
+        self._put = put
         buffer_bytes = config.receive_buffer_kb * 1024
         self._data_socket = open_udp(config.address, config.data_port, buffer_bytes)
         try:
@@ -83,21 +89,31 @@ class LidarPort(Worker):
         except BaseException:
             self._data_socket.close()
             raise
-        self._warn_of_small_buffer(self._data_socket, buffer_bytes)
-        self._data = _Batch(self._data_socket, SCAN_PACKET_DTYPE, 8, hdl32e.DATA_BYTES, _DATA_SLOTS, log_time)
+        self._poll_s = self._pause_for_buffer(config.poll_ms / 1e3, buffer_bytes)
+        self._data = _Batch(
+            self._data_socket, SCAN_PACKET_DTYPE, 8, hdl32e.DATA_BYTES, _DATA_SLOTS, log_time, self._poll_s
+        )
         self._position = _Batch(
-            self._position_socket, hdl32e.POSITION_DTYPE, 0, hdl32e.POSITION_BYTES, _POSITION_SLOTS, log_time
+            self._position_socket,
+            hdl32e.POSITION_DTYPE,
+            0,
+            hdl32e.POSITION_BYTES,
+            _POSITION_SLOTS,
+            log_time,
+            BATCH_NS / NS_PER_S,
         )
         self._told: set[str] = set()
 
-    @staticmethod
-    def _warn_of_small_buffer(sock: socket.socket, asked_bytes: int) -> None:
-        granted = granted_buffer_bytes(sock)
+    def _pause_for_buffer(self, poll_s: float, asked_bytes: int) -> float:
+        """Time between two polls that the receive buffer stands; a small one is told of."""
+        granted = granted_buffer_bytes(self._data_socket)
         if granted < asked_bytes:
             _log.warning(
                 "the kernel grants a receive buffer of %d kB of the %d kB asked for; raise net.core.rmem_max to %d",
                 granted // 1024, asked_bytes // 1024, asked_bytes,
             )  # fmt: skip
+
+        return min(poll_s, _SMALL_BUFFER_POLL_S) if granted < _SMALL_BUFFER_BYTES else poll_s
 
     def close(self) -> None:
         """Close the sockets of a port that was never started."""
@@ -107,11 +123,14 @@ class LidarPort(Worker):
     def work(self) -> None:
         """Poll until asked to stop, then hand over what is left."""
         try:
+            position_due_ns = 0
             while not self.stopping:
-                self._poll(self._data, self._close_data)
-                self._poll(self._position, self._close_position)
+                busy = self._poll(self._data, self._close_data)
                 self.progress()
-                self.pause(self._poll_s)
+                if self.progress_ns >= position_due_ns:
+                    self._poll(self._position, self._close_position)
+                    position_due_ns = self.progress_ns + BATCH_NS
+                time.sleep(_BUSY_POLL_S if busy else self._poll_s)
             self._poll(self._data, self._close_data)
             self._poll(self._position, self._close_position)
             for batch in (self._data, self._position):
@@ -121,12 +140,16 @@ class LidarPort(Worker):
         finally:
             self.close()
 
-    def _poll(self, batch: "_Batch", close: "Callable[[_Batch], None]") -> None:
+    def _poll(self, batch: "_Batch", close: "Callable[[_Batch], None]") -> bool:
+        """Empty a socket; True if there was more than the slots hold."""
+        busy = False
         while not batch.fill() and not self.stopping:  # full, and there may be more
             close(batch)
             self.progress()
+            busy = True
         if batch.due():
             close(batch)
+        return busy
 
     # Data packets -------------------------------------------------------------------------------------------------
 
@@ -218,12 +241,19 @@ class _Batch:
     """Slots that fill up from poll to poll, with the receive times of what is in them."""
 
     def __init__(
-        self, sock: socket.socket, dtype: np.dtype[np.void], offset: int, size: int, slots: int, log_time: LogTime
+        self,
+        sock: socket.socket,
+        dtype: np.dtype[np.void],
+        offset: int,
+        size: int,
+        slots: int,
+        log_time: LogTime,
+        poll_s: float,
     ) -> None:
         self._slots = np.zeros(slots, dtype)
         self._time_ns = np.zeros(slots, np.int64)
         self._count = 0
-        self._opened_ns = 0
+        self._poll_ns = round(poll_s * NS_PER_S)
         self._drops_told = 0
         self._log_time = log_time
         self._now = read_clocks()
@@ -234,20 +264,21 @@ class _Batch:
         """Take what is waiting; True if that was everything, False if the slots are full."""
         first = self._count
         count = self.receiver.receive(first)
-        self._now = read_clocks()
         if count:
+            self._now = read_clocks()
             part = slice(first, first + count)
             stamps_ns = self.receiver.stamps_ns[part]
             stamps_ns[stamps_ns == 0] = self._now.realtime_ns
             self._time_ns[part] = self._kernel_time.convert(stamps_ns, self._now)
             self._count += count
-            if first == 0:
-                self._opened_ns = self.now_ns()
         return self._count < len(self._slots)
 
     def due(self) -> bool:
-        """Whether what is in here has waited long enough."""
-        return self._count > 0 and self.now_ns() - self._opened_ns >= BATCH_NS
+        """Whether what is in here will be as old as a message may be before anyone looks again."""
+        if not self._count:
+            return False
+        age_ns = self._log_time.anchor_ns + time.monotonic_ns() - int(self._time_ns[0])
+        return age_ns >= BATCH_NS - self._poll_ns // 2
 
     def take(self) -> tuple[npt.NDArray[np.void], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Datagrams with receive time (in data packets also inside), their sizes; valid until the next `fill`."""
@@ -265,5 +296,5 @@ class _Batch:
         return new
 
     def now_ns(self) -> int:
-        """Log time of the last poll [ns]."""
-        return self._log_time.at(self._now)
+        """Log time [ns]."""
+        return self._log_time.at(read_clocks())

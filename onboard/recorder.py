@@ -22,8 +22,6 @@ from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
 
-TICK_S: Final = 0.1
-"""How often the backlog is written out."""
 _RESERVE_BYTES: Final = 4 << 20
 """Room of the backlog beyond its limit that only small messages may use, so that a stalled disk costs lidar packets first."""
 
@@ -158,7 +156,7 @@ class Recorder(Worker):
     def __init__(self, config: RecorderConfig, segment: Segment) -> None:
         super().__init__("recorder")
         self._segment = segment
-        self._sync_ns = config.sync_ms * NS_PER_MS
+        self._sync_s = config.sync_ms / 1e3
         self.backlog = Backlog(config.backlog_mb << 20)
         self.counts = RecorderCounts(segment=segment.path.name, last_sync_ns=time.monotonic_ns())
 
@@ -171,10 +169,9 @@ class Recorder(Worker):
         try:
             while not self.stopping:
                 self._write_all()
-                if time.monotonic_ns() - self.counts.last_sync_ns >= self._sync_ns:
-                    self._sync()
+                self._sync()
                 self.progress()
-                self.pause(TICK_S)
+                self.pause(self._sync_s)
             self._write_all()
         finally:
             self._segment.close()
