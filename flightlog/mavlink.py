@@ -4,7 +4,9 @@ The dialect is pymavlink's `ardupilotmega`; framing is ours because a log holds 
 and because frames whose checksum cannot be known must not pass for messages.
 """
 
+import re
 from collections.abc import Iterable, Sequence
+from enum import Enum
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 _STX_1: Final = 0xFE
 _STX_2: Final = 0xFD
+_START: Final = re.compile(rb"[\xfd\xfe]")
 _SIGNED: Final = 0x01
 _SIGNATURE_BYTES: Final = 13
 _CRC_EXTRA: Final[dict[int, int]] = {number: kind.crc_extra for number, kind in dialect.mavlink_map.items()}
@@ -55,6 +58,8 @@ class Frame(NamedTuple):
 class FrameParser:
     """Cuts a byte stream into frames; keeps an unfinished one until the rest comes.
 
+    Which known frames come out does not depend on how the stream was cut into pieces.
+
     Attributes
     ----------
     bad_bytes : int
@@ -67,75 +72,126 @@ class FrameParser:
         self.bad_bytes = 0
         self.unknown = 0
         self._rest = b""
+        self._start = 0
+        """Place of the first byte of `_rest` in the stream."""
+        self._pieces: list[tuple[int, int]] = []
+        """Place in the stream where a piece ended, and its receive time [ns], of the pieces that `_rest` is made of."""
 
     def feed(self, time_ns: int, data: bytes) -> list[Frame]:
         """Take the next bytes, received at `time_ns` [ns of log time], and give the frames that they complete."""
-        buffer = self._rest + data
-        frames: list[Frame] = []
-        offset, end = 0, len(buffer)
-        while offset < end:
+        self._rest += data
+        self._pieces.append((self._start + len(self._rest), time_ns))
+        return self._cut(last=False)
+
+    def finish(self) -> list[Frame]:
+        """Give what frames are left among the bytes held back, and count the rest as bad: no more bytes will come."""
+        return self._cut(last=True)
+
+    def _cut(self, *, last: bool) -> list[Frame]:
+        buffer, frames = self._rest, []
+        offset = 0
+        while True:
             start = _next_start(buffer, offset)
             self.bad_bytes += start - offset
             offset = start
-            size = _frame_size(buffer, offset)
-            if size is None or offset + size > end:
+            if offset == len(buffer):
                 break
-            frame = _read_frame(buffer, offset, size, time_ns)
-            if frame is None:
+            frame = _frame_at(buffer, offset, last=last)
+            if frame is _Answer.WAIT:
+                break
+            if frame is _Answer.NONE:
                 self.bad_bytes += 1
                 offset += 1
                 continue
             self.unknown += not frame.known
-            frames.append(frame)
-            offset += size
+            offset += len(frame.data)
+            frames.append(frame._replace(time_ns=self._time_ns(offset)))
         self._rest = buffer[offset:]
+        self._start += offset
+        self._pieces = [piece for piece in self._pieces if piece[0] > self._start]
         return frames
 
-    def finish(self) -> None:
-        """Count what is left as bad: no more bytes will come."""
-        rest, self._rest = self._rest, b""
-        self.bad_bytes += len(rest)
+    def _time_ns(self, end: int) -> int:
+        """Receive time of the byte before `end` in `_rest`."""
+        return next(time_ns for place, time_ns in self._pieces if place >= self._start + end)
+
+
+class _Answer(Enum):
+    NONE = 0
+    """No frame begins here."""
+    WAIT = 1
+    """More bytes will tell."""
+
+
+def _frame_at(buffer: bytes, offset: int, *, last: bool) -> Frame | _Answer:
+    """The frame at `offset`, not yet timed; with `last` there is nothing to wait for."""
+    unfinished = _Answer.NONE if last else _Answer.WAIT
+    size = _frame_size(buffer, offset)
+    if size is None or offset + size > len(buffer):
+        return unfinished
+    frame = _read_frame(buffer, offset, size) if size else None
+    if frame is None:
+        return _Answer.NONE
+    if frame.known:
+        return frame
+    doubt = _doubt(buffer, offset, offset + size)
+    if doubt is _Answer.WAIT and last:
+        return frame
+    return frame if doubt is None else doubt
+
+
+def _doubt(buffer: bytes, offset: int, end: int) -> _Answer | None:
+    """What speaks against a frame with an id outside the dialect: noise looks like one too, and must not hide known frames."""
+    if end < len(buffer) and not _START.match(buffer, end):
+        return _Answer.NONE
+    doubt = None
+    inside = _next_start(buffer, offset + 1)
+    while inside < end:
+        size = _frame_size(buffer, inside)
+        if size is None or inside + size > len(buffer):
+            doubt = _Answer.WAIT
+        elif size:
+            frame = _read_frame(buffer, inside, size)
+            if frame is not None and frame.known:
+                return _Answer.NONE
+        inside = _next_start(buffer, inside + 1)
+    return doubt
 
 
 def _next_start(buffer: bytes, offset: int) -> int:
     """Offset of the next start byte, or the end."""
-    if buffer[offset] in (_STX_1, _STX_2):
-        return offset
-    one, two = buffer.find(b"\xfe", offset), buffer.find(b"\xfd", offset)
-    return min((position for position in (one, two) if position >= 0), default=len(buffer))
+    found = _START.search(buffer, offset)
+    return found.start() if found else len(buffer)
 
 
 def _frame_size(buffer: bytes, offset: int) -> int | None:
-    """Size that the frame at `offset` claims, None where too little of it is there to tell."""
+    """Size that the frame at `offset` claims: None where too little of it is there to tell, 0 where none can start."""
     if len(buffer) < offset + 3:
         return None
     if buffer[offset] == _STX_1:
         return buffer[offset + 1] + 8
-    return buffer[offset + 1] + 12 + (_SIGNATURE_BYTES if buffer[offset + 2] & _SIGNED else 0)
+    flags = buffer[offset + 2]
+    if flags & ~_SIGNED:  # a frame with a flag that we do not know must not be read (MAVLink 2, incompatibility flags)
+        return 0
+    return buffer[offset + 1] + 12 + (_SIGNATURE_BYTES if flags & _SIGNED else 0)
 
 
-def _read_frame(buffer: bytes, offset: int, size: int, time_ns: int) -> Frame | None:
-    """Check the frame at `offset`; None where it is none."""
+def _read_frame(buffer: bytes, offset: int, size: int) -> Frame | None:
+    """The frame at `offset`, not yet timed; None where its checksum is wrong."""
     data = buffer[offset : offset + size]
     if data[0] == _STX_1:
         version, head = 1, 6
         sequence, system, component, message_id = data[2], data[3], data[4], data[5]
     else:
         version, head = 2, 10
-        if data[2] & ~_SIGNED:
-            return None
         sequence, system, component = data[4], data[5], data[6]
         message_id = data[7] | data[8] << 8 | data[9] << 16
-    end = head + data[1]
     extra = _CRC_EXTRA.get(message_id)
-    if extra is None:
-        # no checksum to go by: only a following start byte, or silence, makes it worth a record
-        if offset + size < len(buffer) and buffer[offset + size] not in (_STX_1, _STX_2):
+    if extra is not None:
+        end = head + data[1]
+        if checksum(data[1:end] + bytes((extra,))) != data[end] | data[end + 1] << 8:
             return None
-        return Frame(time_ns, system, component, message_id, sequence, version, False, data)
-    if checksum(data[1:end] + bytes((extra,))) != data[end] | data[end + 1] << 8:
-        return None
-    return Frame(time_ns, system, component, message_id, sequence, version, True, data)
+    return Frame(0, system, component, message_id, sequence, version, extra is not None, data)
 
 
 def message_id(name: str) -> int:
@@ -223,19 +279,7 @@ def autopilots(frames: Iterable[Frame]) -> list[tuple[int, int]]:
 
 def decode(frame: Frame) -> Any | None:
     """The frame as pymavlink's message object, None for an unknown one; for the odd message, not for streams."""
-    if not frame.known:
-        return None
-    kind = dialect.mavlink_map[frame.message_id]
-    payload = frame.payload.ljust(kind.unpacker.size, b"\x00")[: kind.unpacker.size]
-    values = kind.unpacker.unpack(payload)
-    fields, position = [], 0
-    for order in range(len(kind.ordered_fieldnames)):
-        length = kind.array_lengths[order]
-        if length and not isinstance(values[position], bytes):
-            fields.append(list(values[position : position + length]))
-            position += length
-        else:
-            fields.append(values[position])
-            position += 1
-    by_name = dict(zip(kind.ordered_fieldnames, fields, strict=True))
-    return kind(*(by_name[name] for name in kind.fieldnames))
+    return _DECODER.decode(bytearray(frame.data)) if frame.known else None
+
+
+_DECODER: Final = dialect.MAVLink(None)
