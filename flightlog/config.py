@@ -172,7 +172,7 @@ def to_mapping(config: Any) -> Any:
 
 
 def dump(config: Any) -> str:
-    """The YAML text of a configuration; `loads` turns it back into an equal one."""
+    """The YAML text of a configuration; `loads` turns it back into an equal one (but for the line separators of Unicode)."""
     return yaml.safe_dump(to_mapping(config), sort_keys=False, allow_unicode=True)
 
 

@@ -146,7 +146,8 @@ def test_the_sample_file_loads_back_to_the_defaults_and_names_every_option() -> 
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
-texts = st.text(st.characters(codec="utf-8"))
+# PyYAML writes NEL and the line separators of Unicode so that it reads spaces back
+texts = st.text(st.characters(codec="utf-8", exclude_characters="\x85\u2028\u2029"))
 degrees = st.floats(0, 360)
 windows = st.builds(Window, degrees, degrees)
 recorders = st.builds(
