@@ -166,7 +166,7 @@ class UdpSource(Source):
             now: Clocks = read_clocks()
             stamps_ns = self._receiver.stamps_ns[:count]
             stamps_ns[stamps_ns == 0] = now.realtime_ns
-            times_ns = self._kernel_time.convert(stamps_ns, now).tolist()
+            times_ns = self._kernel_time.convert(stamps_ns, now, emptied=count < _UDP_SLOTS).tolist()
             sizes = self._receiver.sizes[:count].tolist()
             chunks += [
                 (time_ns, self._bytes[i, :size].tobytes())

@@ -160,11 +160,11 @@ class LidarPort(Worker):
         if not len(packets) and not drops:
             return
         right_size = sizes == hdl32e.DATA_BYTES
-        whole = packets[right_size] if not right_size.all() else packets
+        whole = fovmask.select(packets, right_size) if not right_size.all() else packets
         good = hdl32e.is_data(whole["data"])
         if not good.all():
             self._tell_foreign(whole["data"][~good])
-            whole = whole[good]
+            whole = fovmask.select(whole, good)
         masked = fovmask.apply(whole, self.window)
         stamp_ns = int(time_ns[-1]) if len(time_ns) else batch.now_ns()
         written = len(masked.packets) > 0 and self._put(
@@ -224,7 +224,7 @@ class LidarPort(Worker):
         self._reject("position packet of a wrong length", int((~right_size).sum()))
         self._reject("position packet with other content", int((right_size & ~good).sum()))
         self.counts.position_received += len(packets)
-        kept, kept_ns = packets[good], time_ns[good]
+        kept, kept_ns = fovmask.select(packets, good), time_ns[good]
         if not len(kept):
             return
         stamp_ns = int(kept_ns[-1])
@@ -269,7 +269,9 @@ class _Batch:
             part = slice(first, first + count)
             stamps_ns = self.receiver.stamps_ns[part]
             stamps_ns[stamps_ns == 0] = self._now.realtime_ns
-            self._time_ns[part] = self._kernel_time.convert(stamps_ns, self._now)
+            self._time_ns[part] = self._kernel_time.convert(
+                stamps_ns, self._now, emptied=first + count < len(self._slots)
+            )
             self._count += count
         return self._count < len(self._slots)
 

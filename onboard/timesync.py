@@ -79,25 +79,27 @@ class KernelTime:
         self._log_time = log_time
         self._before = self._earlier = now
 
-    def convert(self, stamps_ns: npt.NDArray[np.int64], now: Clocks) -> npt.NDArray[np.int64]:
-        """Log times of the packets that one poll found.
+    def convert(self, stamps_ns: npt.NDArray[np.int64], now: Clocks, *, emptied: bool = True) -> npt.NDArray[np.int64]:
+        """Log times of packets that a poll found.
 
         Parameters
         ----------
         stamps_ns : ndarray of int64, shape (n,)
             The kernel's stamps on the wall clock, in order of arrival.
         now : Clocks
-            Read after the socket was emptied.
+            Read after they were taken.
+        emptied : bool
+            Whether that emptied the socket; if not, what comes next may have arrived before these were taken.
 
         Returns
         -------
         ndarray of int64, shape (n,)
             [ns of log time], never later than now nor earlier than the poll before the last.
         """
-        before, self._before = self._before, now
-        earlier, self._earlier = self._earlier, before
-        offset_ns = stepped_offset_ns(stamps_ns, before, now)
-        monotonic_ns = np.clip(stamps_ns - offset_ns, earlier.monotonic_ns, now.monotonic_ns)
+        offset_ns = stepped_offset_ns(stamps_ns, self._before, now)
+        monotonic_ns = np.clip(stamps_ns - offset_ns, self._earlier.monotonic_ns, now.monotonic_ns)
+        if emptied:
+            self._earlier, self._before = self._before, now
         return np.asarray(monotonic_ns + self._log_time.anchor_ns)
 
 

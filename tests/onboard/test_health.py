@@ -1,0 +1,91 @@
+from dataclasses import replace
+
+import pytest
+
+from flightlog.errors import SwathError
+from onboard import health
+from onboard.health import Level, LidarStatus, LinkStatus, RecorderStatus, Status
+
+S = 1_000_000_000
+GOOD = Status(
+    time_ns=100 * S,
+    boot_id="b",
+    version="1",
+    pid=1,
+    uptime_s=10.0,
+    clock_steps=0,
+    lidar=LidarStatus(age_s=0.1, packets_s=1808.0, received=18080, kept=10500),
+    links={"ins": LinkStatus(connected=True, age_s=0.1, frames_s=60.0, autopilot="1/1", version=1)},
+    recorder=RecorderStatus(segment="00001-000.mcap", sync_age_s=0.4),
+)
+
+
+def judged(status: Status, now_ns: int = 101 * S) -> tuple[Level, list[str]]:
+    verdict = health.judge(status, now_ns, "b")
+    return verdict.level, verdict.findings
+
+
+def test_all_well_is_good() -> None:
+    assert judged(GOOD) == (Level.GOOD, [])
+
+
+@pytest.mark.parametrize(
+    ("lidar", "level", "finding"),
+    [
+        (LidarStatus(), 2, "lidar: no packet yet; check power, cable and addresses"),
+        (LidarStatus(rejected={"odd": 3}), 2, "lidar: packets arrive, but none is an HDL-32E's"),
+        (LidarStatus(age_s=3.0), 2, "lidar: silent for 3 s"),
+        (LidarStatus(age_s=0.1, kernel_drops=5), 1, "lidar: 5 packets lost in the receive buffer"),
+        (LidarStatus(age_s=0.1, queue_drops=5), 1, "lidar: 5 packets lost because the disk was too slow"),
+        (LidarStatus(age_s=0.1, rejected={"data packet of another sensor: VLP-16": 2}), 1,
+         "lidar: 2 x data packet of another sensor: VLP-16"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_the_lidar_is_told_apart_by_name(lidar: LidarStatus, level: int, finding: str) -> None:
+    assert judged(replace(GOOD, lidar=lidar))[0] == level
+    assert finding in judged(replace(GOOD, lidar=lidar))[1]
+
+
+@pytest.mark.parametrize(
+    ("link", "finding"),
+    [
+        (LinkStatus(trouble="serial device x cannot be opened"), "link ins: serial device x cannot be opened"),
+        (LinkStatus(connected=True), "link ins: open, but no autopilot heard"),
+        (LinkStatus(connected=True, age_s=9.0), "link ins: autopilot silent for 9 s"),
+    ],
+)
+def test_what_is_wrong_with_a_link_is_told_apart_by_name(link: LinkStatus, finding: str) -> None:
+    assert judged(replace(GOOD, links={"ins": link})) == (Level.WARNING, [finding])
+
+
+def test_an_old_status_says_stale_whatever_it_says() -> None:
+    assert judged(GOOD, 107 * S) == (Level.CRITICAL, ["stale: the status is 7 s old; swathd does not run or hangs"])
+    other_boot = health.judge(GOOD, 101 * S, "another")
+    assert (other_boot.level, other_boot.findings) == (2, ["stale: the status is from before the last boot"])
+
+
+def test_a_recorder_that_does_not_reach_the_disk_is_critical() -> None:
+    slow = replace(GOOD, recorder=RecorderStatus(sync_age_s=8.0))
+    assert judged(slow) == (Level.CRITICAL, ["recorder: nothing reached the disk for 8 s"])
+
+
+def test_a_status_survives_its_file() -> None:
+    assert health.from_json(health.to_json(GOOD), "here") == GOOD
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "null", '{"lidar": 3}', health.to_json(GOOD).replace("pid", "pit")])
+def test_another_file_is_no_status(text: str) -> None:
+    with pytest.raises(SwathError, match=r"^s\.json: is no status file of this version of swathd$"):
+        health.from_json(text, "s.json")
+
+
+def test_a_worker_is_stalled_when_it_has_made_no_progress_for_too_long() -> None:
+    progress = {"lidar": 99 * S, "recorder": 90 * S}
+    assert health.stalled(progress, 100 * S) == ["recorder has made no progress for 10.0 s"]
+    assert health.stalled(progress, 100 * S, 20 * S) == []
+
+
+def test_the_report_has_the_verdict_first() -> None:
+    lines = health.report(GOOD, health.judge(GOOD, 101 * S, "b"))
+    assert lines[0].startswith("GOOD: 00001-000.mcap: lidar 1808/s")
+    assert len(lines) == 4

@@ -1,0 +1,119 @@
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from flightlog import records
+from flightlog.errors import LogError
+from flightlog.logfile import LogReader
+from flightlog.records import HostClock
+from onboard.config import RecorderConfig
+from onboard.recorder import Backlog, Recorder, Segment, next_segment_path, write_atomically
+
+FIRST = (records.HOST_CLOCK.topic, 5, records.encode_host_clock(HostClock(5, 6, 7, 8)))
+
+
+def segment(path: Path) -> Segment:
+    return Segment(path, {"swath.session": {"host": "here"}}, {"mount.yaml": b"x: 1\n"}, ["/mavlink/ins"], FIRST)
+
+
+def test_names_count_boots_and_segments_within_a_boot(tmp_path: Path) -> None:
+    names = []
+    for boot in ("a", "a", "b", "b", "c"):
+        path = next_segment_path(tmp_path / "logs", boot)
+        path.touch()
+        names.append(path.name)
+    assert names == [
+        "00001-000.mcap", "00001-001.mcap", "00002-000.mcap", "00002-001.mcap", "00003-000.mcap",
+    ]  # fmt: skip
+
+
+def test_the_boot_counter_outlives_the_logs_and_the_logs_outlive_the_counter(tmp_path: Path) -> None:
+    for boot in ("a", "b"):
+        next_segment_path(tmp_path, boot).touch()
+    for path in tmp_path.glob("*.mcap"):
+        path.unlink()
+    assert next_segment_path(tmp_path, "c").name == "00003-000.mcap"
+    (tmp_path / "00007-002.mcap").touch()
+    assert next_segment_path(tmp_path, "c").name == "00008-000.mcap"
+    (tmp_path / "00008-000.mcap").touch()
+    (tmp_path / "boot.json").write_text("{ damaged")
+    assert next_segment_path(tmp_path, "d").name == "00009-000.mcap"
+
+
+@pytest.mark.parametrize("folder", ["file/logs", "file"])
+def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path: Path, folder: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(LogError, match=r"logs cannot be written there \((Not a directory|File exists)\)"):
+        next_segment_path(tmp_path / folder, "a")
+
+
+def test_an_existing_segment_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "00001-000.mcap").write_bytes(b"a flight")
+    with pytest.raises(LogError, match="File exists"):
+        segment(tmp_path / "00001-000.mcap")
+    assert (tmp_path / "00001-000.mcap").read_bytes() == b"a flight"
+
+
+def test_what_a_log_needs_to_be_read_is_in_the_file_as_soon_as_it_is_open(tmp_path: Path) -> None:
+    opened = segment(tmp_path / "a.mcap")
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes((tmp_path / "a.mcap").read_bytes())  # what is on the disk now
+    with LogReader(copy) as log:
+        assert log.metadata["swath.session"] == {"host": "here"}
+        assert log.attachments == {"mount.yaml": b"x: 1\n"}
+        assert [message.topic for message in log.messages()] == [records.HOST_CLOCK.topic]
+        assert log.damage.truncated
+    opened.close()
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert not log.damage
+
+
+def test_a_full_backlog_refuses_at_once_and_keeps_room_for_small_messages() -> None:
+    backlog = Backlog(1000)
+    assert backlog.put("a", 1, bytes(600), vital=False)
+    assert not backlog.put("b", 2, bytes(600), vital=False)
+    assert backlog.put("c", 3, bytes(600), vital=True)
+    assert (backlog.size_bytes, backlog.refused) == (1200, 1)
+    assert [backlog.get().topic for _ in range(2)] == ["a", "c"]  # type: ignore[union-attr]
+    assert backlog.get() is None
+    assert backlog.size_bytes == 0
+
+
+def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_the_end(tmp_path: Path) -> None:
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=100), segment(tmp_path / "a.mcap"))
+    recorder.start()
+    assert recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, b"one")], "ins"), True)
+    time.sleep(0.4)
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes((tmp_path / "a.mcap").read_bytes())
+    with LogReader(copy) as log:
+        assert [records.decode_raw(message.data) for message in log.messages(("/mavlink/",))] == [[(10, b"one")]]
+    recorder.put("/mavlink/ins", 11, records.encode_raw(11, [(11, b"two")], "ins"), True)
+    recorder.stop()
+    assert recorder.failure is None
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert not log.damage
+        assert len(list(log.messages(("/mavlink/",)))) == 2
+    assert recorder.counts.syncs >= 2
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")  # noqa: PTH110
+def test_a_disk_that_takes_nothing_is_a_failure_with_a_reason(tmp_path: Path) -> None:
+    opened = segment(tmp_path / "a.mcap")
+    with open("/dev/full", "wb") as full:  # noqa: PTH123
+        os.dup2(full.fileno(), opened._file.fileno())
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=50), opened)
+    recorder.start()
+    recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, bytes(100_000))], "ins"), True)
+    recorder.join(5)
+    assert recorder.failure is not None
+    assert "No space left on device" in recorder.failure
+
+
+def test_a_file_replaced_atomically_is_never_seen_half_written(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "s", "one")
+    write_atomically(tmp_path / "s", "two", sync=False)
+    assert (tmp_path / "s").read_text() == "two"
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
