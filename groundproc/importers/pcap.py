@@ -85,7 +85,7 @@ def packets(stream: BinaryIO, count: CaptureCount, place: str) -> Iterator[Packe
     """
     magic = stream.read(4)
     if magic in _CLASSIC:
-        yield from _classic(stream, *_CLASSIC[magic], count)
+        yield from _classic(stream, magic, count)
     elif magic == struct.pack("<I", _SECTION):
         yield from _blocks(stream, count, place)
     elif not magic:
@@ -102,12 +102,13 @@ def _torn(stream: BinaryIO, count: CaptureCount, start: bytes, what: str) -> Non
         count.lost_bytes += len(rest)
 
 
-def _classic(stream: BinaryIO, order: str, tick_ns: int, count: CaptureCount) -> Iterator[Packet]:
-    head = stream.read(20)
-    if len(head) < 20:
+def _classic(stream: BinaryIO, magic: bytes, count: CaptureCount) -> Iterator[Packet]:
+    order, tick_ns = _CLASSIC[magic]
+    head = magic + stream.read(20)
+    if len(head) < 24:
         _torn(stream, count, head, "ends within the file header")
         return
-    link = struct.unpack(order + "I", head[16:])[0] & 0x0FFFFFFF
+    link = struct.unpack(order + "I", head[20:])[0] & 0xFFFF
     record = struct.Struct(order + "IIII")
     while head := stream.read(record.size):
         if len(head) < record.size:

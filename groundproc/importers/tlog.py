@@ -91,8 +91,15 @@ def records(data: Bytes, count: TlogCount) -> Iterator[Record]:
 
 
 def is_tlog(head: bytes) -> bool:
-    """Whether the beginning of a file holds a stamped good frame."""
-    return _next_good(head[:_HEAD_BYTES], 0) < len(head[:_HEAD_BYTES])
+    """Whether the beginning of a file holds stamped good frames: one at its very start, or two behind each other."""
+    head = head[:_HEAD_BYTES]
+    offset = _next_good(head, 0)
+    while 0 < offset < len(head):
+        end = _frame_end(head, offset + _STAMP_BYTES)
+        if end is not None and _is_stamped_frame(head, end):
+            return True
+        offset = _next_good(head, offset + 1)
+    return offset < len(head)
 
 
 def is_plain_mavlink(head: bytes) -> bool:

@@ -18,8 +18,8 @@ from flightlog.records import LidarAccount
 from groundproc.load import LidarBatch
 from groundproc.summary.clockfit import drift
 
-_BIN: Final = 50
-"""Width of a bin of azimuth [0.01 deg]."""
+_COVERED: Final = 50
+"""Azimuth counts as covered in pieces of this width [0.01 deg]."""
 _EDGE: Final = 10
 """How far a packet that is not there may be off the place where it is looked for [0.01 deg]."""
 _NARROWEST: Final = 400
@@ -48,7 +48,8 @@ class LidarSummary:
     totals: dict[str, int] = field(default_factory=dict)
     window: tuple[int, int] | None = None
     """The window applied aboard [0.01 deg]."""
-    bins: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(AZIMUTH_STEPS // _BIN, np.int64))
+    seen: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(AZIMUTH_STEPS, np.bool_))
+    """Azimuths of blocks."""
     turned: float = 0.0
     """Azimuth passed [0.01 deg], and the time it took [ns], over neighbouring packets."""
     turning_ns: int = 0
@@ -75,8 +76,7 @@ class LidarSummary:
         self.shots_with_return += int(np.count_nonzero(data["blocks"]["returns"]["range"]))
         for mode, count in zip(*np.unique(data["return_mode"], return_counts=True), strict=True):
             self.modes[int(mode)] = self.modes.get(int(mode), 0) + int(count)
-        blocks = (data["blocks"]["azimuth"].astype(np.int64) % AZIMUTH_STEPS) // _BIN
-        self.bins += np.bincount(blocks.ravel(), minlength=len(self.bins))
+        self.seen[data["blocks"]["azimuth"].ravel() % AZIMUTH_STEPS] = True
         self._steps(data, batch.device_time_ns)
         late_ns = batch.receive_time_ns - batch.device_time_ns
         earliest = int(np.argmin(late_ns))
@@ -110,7 +110,8 @@ class LidarSummary:
             turned_sum, sum_ns = int(turned[usual].sum()), int(passed_ns[neighbours][usual].sum())
             self.turned += turned_sum
             self.turning_ns += sum_ns
-            self.rates_rpm.append(turned_sum / sum_ns * 60 * NS_PER_S / AZIMUTH_STEPS)
+            if sum_ns:
+                self.rates_rpm.append(turned_sum / sum_ns * 60 * NS_PER_S / AZIMUTH_STEPS)
         gaps = missing > 0
         if gaps.any() and self.turning_ns:
             step = self.turned / self.turning_ns * packet_ns
@@ -139,7 +140,7 @@ class LidarSummary:
             "account": dict(self.totals) if self.accounts else None,
             "window_aboard_deg": [value / 100 for value in self.window] if self.window else None,
             "sensor_fov_deg": [sensor_off[1] / 100, sensor_off[0] / 100] if sensor_off else None,
-            "azimuth_coverage_deg": round(np.count_nonzero(self.bins) * _BIN / 100, 1),
+            "azimuth_coverage_deg": int(self.seen.reshape(-1, _COVERED).any(axis=1).sum()) * _COVERED / 100,
             "clock": drift(np.array(self.clock, np.int64).reshape(-1, 2), self.jumps),
         }
 
@@ -152,22 +153,17 @@ class LidarSummary:
 
     def _empty_sector(self) -> tuple[int, int] | None:
         """Widest sector (start, end) [0.01 deg] that no block ever looked into, inside the window applied aboard."""
-        seen = self.bins > 0
+        seen = self.seen
         if self.window is not None:
-            centres = np.arange(len(seen)) * _BIN + _BIN // 2
             start, end = self.window
-            seen |= (centres - start) % AZIMUTH_STEPS > (end - start) % AZIMUTH_STEPS
-        if seen.all() or not seen.any():
+            seen = seen | ((np.arange(AZIMUTH_STEPS) - start) % AZIMUTH_STEPS > (end - start) % AZIMUTH_STEPS)
+        azimuths = np.flatnonzero(seen)
+        widths = np.diff(azimuths, append=azimuths[0] + AZIMUTH_STEPS)
+        widest = int(np.argmax(widths))
+        if widths[widest] < _NARROWEST:
             return None
-        # turn the circle so that it begins with a bin that was seen
-        turn = int(np.argmax(seen))
-        edges = np.flatnonzero(np.diff(np.concatenate([np.roll(seen, -turn), [True]]).astype(np.int8)))
-        starts, ends = edges[::2] + 1, edges[1::2] + 1
-        widest = int(np.argmax(ends - starts))
-        if (ends[widest] - starts[widest]) * _BIN < _NARROWEST:
-            return None
-        start, end = (int(edge + turn) * _BIN % AZIMUTH_STEPS for edge in (starts[widest], ends[widest]))
-        return start, end
+        start = int(azimuths[widest])
+        return start, (start + int(widths[widest])) % AZIMUTH_STEPS
 
 
 def _reasons(

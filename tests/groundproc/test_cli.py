@@ -1,0 +1,74 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from groundproc.cli import commands, main
+
+BIN = Path(sys.executable).parent
+
+
+def test_all_commands_of_the_package_are_found() -> None:
+    assert {"import", "info", "decode", "process", "simulate"} <= set(commands())
+
+
+def test_help_names_every_command_and_loads_no_numpy() -> None:
+    code = """if True:
+        import sys
+        from groundproc.cli import main
+        try:
+            main(["import", "--help"])
+        except SystemExit:
+            print("numpy" in sys.modules)
+    """
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-1] == "False"
+    run = subprocess.run([BIN / "swath", "--help"], capture_output=True, text=True, check=True)
+    for name in commands():
+        assert f"\n  {name} " in run.stdout
+
+
+def test_version_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("swath ")
+
+
+@pytest.mark.parametrize("words", [["imports"], ["import"], ["info", "--nonsense", "x"]])
+def test_a_wrong_command_line_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_no_command_shows_the_help_and_ends_with_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "import" in capsys.readouterr().err
+
+
+def test_a_missing_log_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(tmp_path / "none.mcap")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("swath: ")
+    assert error.count("\n") == 1
+    assert "none.mcap" in error
+
+
+def test_a_reader_that_goes_away_leaves_no_traceback(monterey_log: Path) -> None:
+    with subprocess.Popen(
+        [BIN / "swath", "info", str(monterey_log), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as run:
+        assert run.stdout is not None
+        assert run.stderr is not None
+        run.stdout.close()
+        assert run.stderr.read() == b""
+        assert run.wait() == 141
+
+
+def test_ctrl_c_ends_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(_: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("groundproc.cli._dispatch", stop)
+    assert main(["info"]) == 130
