@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pymavlink.dialects.v20 import ardupilotmega
 
-from flightlog.constants import NS_PER_MS, NS_PER_US, STANDARD_GRAVITY_M_S2
+from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US, STANDARD_GRAVITY_M_S2
 from simulator.chance import generator
 from simulator.clocks import Clock, Clocks
 from simulator.config import LinkOptions, Options
@@ -26,6 +26,7 @@ Array = npt.NDArray[np.float64]
 _TICK_HZ: Final = 50.0
 _GPS_HZ: Final = 5.0
 _U32: Final = 1 << 32
+_JUST_AFTER_NS: Final = 200
 SYSTEM: Final = 1
 
 
@@ -96,6 +97,8 @@ class Autopilot:
         times, names = self._schedule(start_s, end_s)
         if not len(times):
             return
+        if not self._options.stamp_jitter_s:
+            times = self._on_whole_ms(times)
         jitter_s = rng.uniform(-1, 1, len(times)) * self._options.stamp_jitter_s
         belief = self._ins.belief(times + jitter_s, rng)
         place = geodetic(belief.position_m, self._origin)
@@ -126,6 +129,12 @@ class Autopilot:
         joined = np.concatenate(times)
         order = np.argsort(joined, kind="stable")
         return joined[order], [names[i] for i in order]
+
+    def _on_whole_ms(self, times: Array) -> Array:
+        """The next times at which the boot clock has just gone to another millisecond: stamps without rounding."""
+        clock = self._clocks.boot
+        whole_ns = -(-clock.shows_ns(times) // NS_PER_MS) * NS_PER_MS
+        return clock.time_s((whole_ns - clock.start_ns + _JUST_AFTER_NS) / NS_PER_S)
 
     def _restart(self, time_s: float) -> None:
         after = self._reboot.after(time_s)

@@ -20,9 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for what is written")
     parser.add_argument("--config", type=Path, metavar="YAML", help="options; --sample-config shows all")
     parser.add_argument("--sample-config", action="store_true", help="print a commented file of all options and end")
-    parser.add_argument("--perfect", action="store_true", help="take every error out of the instruments")
+    parser.add_argument(
+        "--perfect", nargs="?", const="all", choices=("lidar", "ins", "all"),
+        help="take every error out of the lidar, of the INS, or (no word) of both",
+    )  # fmt: skip
     parser.add_argument("--returns", choices=("strongest", "last", "dual"), help="return mode of the lidar")
-    parser.add_argument("--truth-points", action="store_true", help="write every true echo too (56 bytes each)")
+    parser.add_argument("--truth-points", action="store_true", help="write every true echo too (59 bytes each)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="threads that cast rays (2)")
     live = parser.add_argument_group("live", "render first, then play in real time to UDP and a pseudo terminal")
     live.add_argument("--live", action="store_true", help="play what was rendered")
@@ -103,4 +106,4 @@ def _options(arguments: argparse.Namespace) -> "Options":
     options = Options() if arguments.config is None else config.load(arguments.config, Options)
     if arguments.returns is not None:
         options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, returns=arguments.returns))
-    return perfect(options) if arguments.perfect else options
+    return perfect(options, arguments.perfect) if arguments.perfect else options

@@ -5,6 +5,7 @@ The defaults are those of wire.md's measurements on real units and of low-cost a
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Final
 
 from flightlog.config import option
 
@@ -177,27 +178,37 @@ class Options:
     capture_resolution: str = option("us", "resolution of the pcap's stamps", choices=("us", "ns"))
 
 
-def perfect(options: Options) -> Options:
-    """The same world with perfect instruments: no error, noise, jitter or vibration; clocks keep offset and drift."""
-    lidar = dataclasses.replace(
-        options.lidar, range_noise_m=0.0, laser_bias_m=0.0, intensity_noise=0.0, encoder_noise_deg=0.0
-    )
-    gyros = GyroOptions(
-        offset_deg_s=(0.0, 0.0, 0.0), noise_deg_s=0.0, rotor_line_deg_s=0.0, accel_noise_g=0.0, accel_rotor_line_g=0.0
-    )
-    zeros = {
-        field.name: 0.0
-        for field in dataclasses.fields(InsOptions)
-        if field.name not in ("gnss_tau_s", "gyro_filter_hz")
-    }
-    return dataclasses.replace(
-        options,
-        lidar=lidar,
-        gyros=gyros,
-        clocks=dataclasses.replace(options.clocks, arrival_jitter_us=0.0),
-        flight=dataclasses.replace(options.flight, vibration_deg=0.0),
-        ins=dataclasses.replace(options.ins, **zeros),
-        link=dataclasses.replace(options.link, stamp_jitter_s=0.0, latency_jitter_s=0.0),
-        mount=MountOptions(),
-        faults=FaultOptions(),
-    )
+PARTS: Final = ("lidar", "ins", "all")
+"""What `perfect` can take the errors out of."""
+
+
+def perfect(options: Options, part: str = "all") -> Options:
+    """The same world with perfect instruments.
+
+    Parameters
+    ----------
+    options : Options
+    part : str
+        lidar: no noise in its ranges, azimuths, gyros and arrival times. ins: no error in what the autopilot believes, its stamps
+        exact, no rotor vibration, which its messages are too rare to follow. all: both. Clocks keep offset and drift, the beams
+        their footprint; mount and faults stay as they are.
+    """
+    if part in ("lidar", "all"):
+        options = dataclasses.replace(
+            options,
+            lidar=dataclasses.replace(
+                options.lidar, range_noise_m=0.0, laser_bias_m=0.0, intensity_noise=0.0, encoder_noise_deg=0.0
+            ),
+            gyros=GyroOptions((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0),
+            clocks=dataclasses.replace(options.clocks, arrival_jitter_us=0.0),
+        )
+    if part in ("ins", "all"):
+        kept = ("gnss_tau_s", "gyro_filter_hz")
+        zeros = {field.name: 0.0 for field in dataclasses.fields(InsOptions) if field.name not in kept}
+        options = dataclasses.replace(
+            options,
+            flight=dataclasses.replace(options.flight, vibration_deg=0.0),
+            ins=dataclasses.replace(options.ins, **zeros),
+            link=dataclasses.replace(options.link, stamp_jitter_s=0.0, latency_jitter_s=0.0),
+        )
+    return options

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flightlog.constants import NS_PER_S
+from flightlog.constants import NS_PER_MS, NS_PER_S
 from simulator.clocks import Clock
 from simulator.config import FaultOptions
 
@@ -39,7 +39,9 @@ class Reboot:
         if not self.after(time_s):
             return first
         elapsed_ns = round(self.end_s * NS_PER_S * (1.0 + first.drift_ppm * 1e-6))
-        return Clock(_FIRST_STAMP_NS - elapsed_ns, first.drift_ppm)
+        start_ns = _FIRST_STAMP_NS - elapsed_ns
+        # the milliseconds go on as before, so that messages built on a whole one stay on it
+        return Clock(start_ns + (first.start_ns - start_ns) % NS_PER_MS, first.drift_ppm)
 
 
 def arriving(sent_s: npt.NDArray[np.float64], options: FaultOptions) -> npt.NDArray[np.bool_]:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from flightlog.constants import NS_PER_US
 from flightlog.hdl32e import (
-    AZIMUTH_STEPS,
     BLOCK_FLAG,
     BLOCKS,
     DATA_DTYPE,
@@ -217,7 +216,7 @@ class Lidar:
             ranges[:] = self._airframe(turn_deg, step_deg)[..., None]
             strengths[~open_shots] = _AIRFRAME_STRENGTH
         ranges[open_shots], strengths[open_shots] = choice[..., RANGE], choice[..., STRENGTH]
-        noise = self._options.range_noise_m * rng.standard_normal(ranges.shape)
+        noise = self._options.range_noise_m * np.asarray(rng.standard_normal(ranges.shape))
         same = ranges[..., 0] == ranges[..., 1]
         noise[same, 1] = noise[same, 0]
         noisy = ranges + noise + self._bias_m[:, None]
@@ -230,7 +229,8 @@ class Lidar:
         blocks = packets["blocks"]
         blocks["flag"] = BLOCK_FLAG
         reported = turn_deg + self._options.encoder_noise_deg * rng.standard_normal(turn_deg.shape)
-        azimuth = (np.rint(reported * 100.0).astype(np.int64) % AZIMUTH_STEPS).astype(np.uint16)
+        # rounded after it is brought into the circle, so that 36000 does occur [measured]
+        azimuth = np.rint(reported % 360.0 * 100.0).astype(np.uint16)
         steps = np.rint(ranges / RANGE_LSB_M).astype(np.uint16)
         values = intensity(strengths)
         # a slot without return carries an intensity all the same, mostly 1 [measured]

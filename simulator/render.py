@@ -262,8 +262,9 @@ class Recording:
         records.set_receive_time_ns(packets, data_ns)
         positions, sent_s = self._simulation.telemetry.between(start_s, end_s, chunk)
         kept = arriving(sent_s, self._options.faults)
-        positions, position_ns = positions[kept], self._arrival_ns(sent_s, rng)[kept]
-        chunks = [(int(t), p.tobytes()) for t, p in zip(position_ns, positions, strict=True)]
+        position_ns = self._arrival_ns(sent_s, rng)
+        # one by one: indexing with a mask would not copy the bytes between the fields, which are zero on the wire
+        chunks = [(int(position_ns[i]), positions[i].tobytes()) for i in np.flatnonzero(kept)]
         wire = [(int(t), DATA_PORT, p.tobytes()) for t, p in zip(data_ns, packets["data"], strict=True)]
         wire += [(t, POSITION_PORT, payload) for t, payload in chunks]
         self._pcap.write(sorted(wire, key=lambda packet: packet[0]))
