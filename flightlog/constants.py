@@ -17,3 +17,4 @@ WGS84_E2: Final = WGS84_F * (2.0 - WGS84_F)
 NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000
+HOUR_NS: Final = 3600 * NS_PER_S

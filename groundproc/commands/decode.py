@@ -1,0 +1,33 @@
+"""`swath decode`: the lidar's points in its own frame; for a look without an INS, and for scans from a tripod."""
+
+import argparse
+from pathlib import Path
+
+HELP = "write the lidar's points in its own frame, without any trajectory"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a flight log, or all parts of one flight")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the cloud, .laz")
+    parser.add_argument(
+        "--fov", default="255-105", metavar="A-B", help="azimuths kept, clockwise, in degrees, or all; default: 255-105"
+    )
+    parser.add_argument(
+        "--min-range", type=float, default=0.0, metavar="M", help="nearer returns are dropped; default: none"
+    )
+    parser.add_argument("--max-range", type=float, default=131.07, metavar="M", help="farther returns are dropped")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Decode, with a progress bar on a terminal."""
+    from groundproc.decode import Gate
+    from groundproc.options import field_of_view
+    from groundproc.progress import stages
+    from groundproc.sensor_cloud import write_sensor_cloud
+
+    gate = Gate(*field_of_view(arguments.fov), arguments.min_range, arguments.max_range)
+    with stages(arguments.logs, {"decode": "points"}) as progress:
+        cloud = write_sensor_cloud(arguments.logs, arguments.output, gate, lambda done: progress("decode", done))
+    print(f"{cloud.points:,} points in {arguments.output}, {cloud.time_scale}")
+    return 0

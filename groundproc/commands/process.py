@@ -1,0 +1,89 @@
+"""`swath process`: a flight log in, a georeferenced cloud out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from groundproc.survey import Survey
+
+HELP = "make a georeferenced cloud of a flight: cloud.laz, trajectory.csv, quality.json, pictures"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a flight log, or all parts of one flight")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the products")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
+    parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
+    parser.add_argument("--method", choices=("ins",), help="how the trajectory is made")
+    parser.add_argument("--epsg", type=int, help="output CRS; default: UTM zone of the first fix")
+    parser.add_argument(
+        "--height", choices=("msl", "ellipsoid", "relative"), help="what heights refer to; default: msl"
+    )
+    parser.add_argument("--geoid", metavar="N", help="geoid above the ellipsoid: a number [m] or a PROJ grid file")
+    parser.add_argument(
+        "--pose-grid", metavar="MS", help="one pose for so long, such as 10ms; default: one for every firing"
+    )
+    parser.add_argument("--sync", choices=("auto", "gyro", "host"), help="how the clocks are tied; default: auto")
+    parser.add_argument("--fov", metavar="A-B", help="azimuths kept, clockwise, in degrees, or all; default: 255-105")
+    parser.add_argument(
+        "--trajectory", type=Path, metavar="CSV", help="poses from elsewhere, in place of the autopilot's"
+    )
+    parser.add_argument("--json", action="store_true", help="print what quality.json holds")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Process, with a progress bar on a terminal."""
+    from groundproc.pipeline import process
+    from groundproc.progress import stages
+
+    survey = _survey(arguments)
+    with stages(arguments.logs, {"read": "clocks and autopilot", "place": "points"}) as progress:
+        quality = process(arguments.logs, survey, arguments.output, progress, arguments.trajectory)
+    if arguments.json:
+        import json
+
+        print(json.dumps(quality, indent=2))
+    else:
+        print(_report(quality, arguments.output))
+    return 0
+
+
+def _survey(arguments: argparse.Namespace) -> Survey:
+    """The survey file with the command line's options laid over it."""
+    from flightlog import config
+    from flightlog.mount import load_mount
+    from groundproc.options import field_of_view, milliseconds
+    from groundproc.survey import Survey
+
+    tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())
+    given = {
+        "epsg": arguments.epsg,
+        "method": arguments.method,
+        "height": arguments.height,
+        "geoid": arguments.geoid,
+        "sync": arguments.sync,
+        "pose_grid_ms": arguments.pose_grid and milliseconds(arguments.pose_grid),
+        "fov_deg": arguments.fov and list(field_of_view(arguments.fov)),
+        "mount": arguments.mount and config.to_mapping(load_mount(arguments.mount)),
+    }
+    return config.from_mapping(tree | {k: v for k, v in given.items() if v is not None}, Survey, "command line")
+
+
+def _report(quality: dict[str, Any], folder: Path) -> str:
+    """A few lines for the terminal."""
+    sync, points, track = quality["sync"], quality["points"], quality["trajectory"]
+    crs, height = quality["crs"], quality["height"]
+    east, north, up = track["median_sigma_m"]
+    lines = [
+        f"{points['written']:,} points in EPSG:{crs['epsg']} ({crs['name']}), heights {height['meaning']}",
+        f"trajectory {track['covered_s']:.1f} s from {track['start']}, sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)",
+        f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
+        + (f"; {sync['note']}" if sync["note"] else ""),
+        f"mount from {quality['mount']['source']}",
+        f"look at {folder / 'cloud_height.png'} and {folder / 'cloud_intensity.png'}; all figures are in {folder / 'quality.json'}",
+    ]
+    return "\n".join(lines)

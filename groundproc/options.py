@@ -1,0 +1,32 @@
+"""Values on the command line that are more than a word or a number."""
+
+import math
+
+from flightlog.errors import UsageError
+
+
+def field_of_view(text: str) -> tuple[float, float]:
+    """Azimuths such as "255-105" or "-105:105", clockwise from first to second, or "all"; degrees."""
+    if text == "all":
+        return 0.0, 360.0
+    words = text.split(":") if ":" in text else text.rsplit("-", 1)
+    try:
+        start, end = (float(word) for word in words)
+        if not (-360.0 <= start <= 360.0 and -360.0 <= end <= 360.0):
+            raise ValueError
+    except ValueError:
+        raise UsageError(
+            f"--fov {text!r}: expected two azimuths such as 255-105 or -105:105, in degrees, or all"
+        ) from None
+    return start, end
+
+
+def milliseconds(text: str) -> float:
+    """A duration such as "10ms", or a plain number of milliseconds."""
+    try:
+        value = float(text.removesuffix("ms"))
+    except ValueError:
+        value = math.nan
+    if not 1.0 <= value <= 1000.0:
+        raise UsageError(f"{text!r}: expected a duration of 1ms to 1000ms")
+    return value

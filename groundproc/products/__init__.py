@@ -1,0 +1,1 @@
+"""What people take home: clouds (las), pictures."""

@@ -1,0 +1,48 @@
+"""survey.yaml: what a user chooses about a survey, with what is taken where he does not."""
+
+from dataclasses import dataclass
+
+from flightlog.config import option
+from flightlog.mount import Mount
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """The options of `swath process`; on the command line they have the same names."""
+
+    mount: Mount | None = option(
+        None, "how the lidar sits on the airframe (lidar: position_m, yaw_deg, ...); null: as the log has it"
+    )
+    epsg: int | None = option(
+        None,
+        "EPSG code of the output, projected and in metres; null: UTM zone of the first fix",
+        minimum=1024,
+        maximum=32767,
+    )
+    height: str = option("msl", "what heights refer to", choices=("msl", "ellipsoid", "relative"))
+    geoid: str | None = option(
+        None,
+        "for height: ellipsoid where the autopilot does not state both heights: the geoid's height above the ellipsoid "
+        "there [m] as a number, or a grid file that PROJ reads (.gtx, .tif)",
+    )
+    method: str = option("ins", "how the trajectory is made", choices=("ins",))
+    pose_grid_ms: float | None = option(
+        None,
+        "one pose for so many milliseconds, as the source did with 10; null: a pose for every firing",
+        minimum=1,
+        maximum=1000,
+    )
+    sync: str = option(
+        "auto",
+        "clock offset from the gyros, from receive times, or gyros with receive times as the fallback",
+        choices=("auto", "gyro", "host"),
+    )
+    fov_deg: tuple[float, float] = option(
+        (255.0, 105.0), "azimuths kept, clockwise from first to second; [0, 360] keeps all", minimum=-360, maximum=360
+    )
+    min_range_m: float = option(1.0, "nearer returns are dropped [m]", minimum=0, maximum=131)
+    max_range_m: float = option(100.0, "farther returns are dropped [m]", minimum=0, maximum=131.07)
+
+    def __post_init__(self) -> None:
+        if self.min_range_m > self.max_range_m:
+            raise ValueError(f"min_range_m {self.min_range_m} is beyond max_range_m {self.max_range_m}")

@@ -1,0 +1,392 @@
+"""Time offset between the lidar's clock and the autopilot's, from their gyros.
+
+Source: FOI-R--4045--SE (2014): both gyros resampled to 100 Hz, high-passed, shifted to maximum correlation. Here all three axes are
+used at once, with the rotation between them solved at every shift (the sum of the singular values of the 3 x 3 cross-correlation is
+what the best rotation would reach), and the peak only starts a least-squares fit of offset, drift, rotation and biases to the samples
+as they were recorded: no sample of a slow gyro is interpolated, so nothing is lost to its rate.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft, ndimage, signal, sparse
+from scipy.interpolate import CubicSpline
+from scipy.sparse.linalg import factorized
+from scipy.spatial.transform import Rotation
+
+from flightlog.constants import NS_PER_S
+from flightlog.errors import SyncError
+
+Array = npt.NDArray[np.float64]
+
+GRID_HZ: Final = 100.0
+"""Rate of the correlation; the source's."""
+FINE_HZ: Final = 400.0
+"""Rate at which the fast gyro is smoothed for the fit."""
+HIGH_PASS_HZ: Final = 0.2
+CUTOFFS_HZ: Final = (3.0, 5.0, 8.0, 12.0, 20.0)
+"""Low-pass of the fast gyro, tried in turn; the one that leaves the smallest residual is kept."""
+LEAST_MOTION_RAD_S: Final = np.deg2rad(1.0)
+"""RMS of the high-passed rate under which there is nothing to correlate."""
+LEAST_PEAK: Final = 0.5
+"""Normalised correlation under which a peak is chance."""
+LEAST_ODDS: Final = 10.0
+"""Log odds of the peak against the next one under which the choice between them is a guess."""
+MOTION_HZ: Final = 1.0
+"""Bandwidth of a multirotor's motion, for the number of independent values behind those odds."""
+LEAST_OVERLAP_S: Final = 10.0
+BIAS_KNOT_S: Final = 30.0
+"""Spacing of the linear spline that takes up both gyros' biases and their drift."""
+DRIFT_PRIOR_PPM: Final = 60.0
+"""Standard deviation of the drift between two crystals before the data speak; the lidar's alone is some 58 ppm."""
+ROTATION_PRIOR_RAD: Final = 0.3
+BLOCK_S: Final = 2.0
+"""Residuals further apart than this are taken to be independent in the stated sigma."""
+
+
+@dataclass(frozen=True, slots=True)
+class GyroTrack:
+    """Samples of a gyro.
+
+    Attributes
+    ----------
+    name : str
+    time_ns : ndarray of int64, shape (n,)
+        On the device's own clock, increasing.
+    rate_rad_s : ndarray, shape (n, 3)
+        In the device's own axes. Constant offsets, however large, do no harm.
+    """
+
+    name: str
+    time_ns: npt.NDArray[np.int64]
+    rate_rad_s: Array
+
+    @property
+    def rate_hz(self) -> float:
+        """Median sample rate [Hz]."""
+        return float(NS_PER_S / np.median(np.diff(self.time_ns))) if len(self.time_ns) > 1 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sync:
+    """How to turn lidar time into autopilot time: t_ins = t_lidar + offset + drift (t_lidar - reference).
+
+    Attributes
+    ----------
+    method : str
+        "gyro", or "host" where only receive times were to be had.
+    offset_ns, sigma_offset_ns : int, float
+        At the reference.
+    reference_ns : int
+        Lidar time of the middle of what was used.
+    drift_ppm, sigma_drift_ppm : float
+    peak : float
+        Normalised correlation at the peak, 0 to 1.
+    rival : float
+        Highest correlation more than 1 s from the peak.
+    residual_rad_s : float
+        RMS of the fit, all axes.
+    samples : int
+        INS samples used.
+    mat_ins_lidar : ndarray, shape (3, 3), or None
+        Rotation (or reflection, where a gyro axis has the opposite sign) between the gyros as solved.
+    mount_angle_deg : float or None
+        Angle between that rotation and the mount's.
+    note : str
+        What a reader must know: a reflection, a fallback and why.
+    """
+
+    method: str
+    offset_ns: int
+    sigma_offset_ns: float
+    reference_ns: int
+    drift_ppm: float = 0.0
+    sigma_drift_ppm: float = 0.0
+    peak: float = 0.0
+    rival: float = 0.0
+    residual_rad_s: float = 0.0
+    samples: int = 0
+    mat_ins_lidar: Array | None = None
+    mount_angle_deg: float | None = None
+    note: str = ""
+    curve: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
+
+    def ins_time_ns(self, lidar_time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Autopilot time [ns] of lidar times, shape (n,)."""
+        since = lidar_time_ns - self.reference_ns
+        return np.asarray(lidar_time_ns + self.offset_ns + np.rint(since * (self.drift_ppm * 1e-6)).astype(np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class _Peak:
+    offset_ns: int
+    height: float
+    rival: float
+    log_odds: float
+    mat_ins_lidar: Array
+    curve: tuple[Array, Array]
+
+
+def synchronise(
+    lidar: GyroTrack,
+    ins: GyroTrack,
+    *,
+    mat_ins_lidar: Array | None = None,
+    expected_ns: int | None = None,
+    search_s: float = 15.0,
+) -> Sync:
+    """Find the offset from lidar time to INS time.
+
+    Parameters
+    ----------
+    lidar : GyroTrack
+        The faster gyro, 50 Hz or more.
+    ins : GyroTrack
+        The slower one, 2 Hz or more.
+    mat_ins_lidar : ndarray, shape (3, 3), optional
+        Rotation of the mount; a start where the motion cannot tell, and what the solved one is compared with.
+    expected_ns : int, optional
+        Offset as receive times have it; only shifts within `search_s` of it are tried. Default: every shift with an overlap.
+
+    Raises
+    ------
+    SyncError
+        Too little overlap or motion, no clear peak, or several of nearly the same height.
+    """
+    peak = _correlate(lidar, ins, mat_ins_lidar, expected_ns, search_s)
+    if peak.height < LEAST_PEAK:
+        raise SyncError(
+            f"gyro correlation of {lidar.name} and {ins.name}: the best peak is {peak.height:.2f}, expected at least {LEAST_PEAK}"
+        )
+    if peak.log_odds < LEAST_ODDS:
+        raise SyncError(
+            f"gyro correlation of {lidar.name} and {ins.name}: the peak of {peak.height:.2f} has a rival of {peak.rival:.2f} "
+            f"(log odds {peak.log_odds:.1f}, expected at least {LEAST_ODDS:.0f}); the motion repeats itself"
+        )
+    fits = [_fit(lidar, ins, peak, cutoff, mat_ins_lidar) for cutoff in CUTOFFS_HZ if cutoff < 0.4 * lidar.rate_hz]
+    if not fits:
+        raise SyncError(f"gyro of {lidar.name}: {lidar.rate_hz:.1f} Hz, expected at least {CUTOFFS_HZ[0] / 0.4:.0f} Hz")
+    return min(fits, key=lambda fit: fit.residual_rad_s)
+
+
+# Correlation ----------------------------------------------------------------------------------------------------------
+
+
+def _correlate(
+    lidar: GyroTrack, ins: GyroTrack, mat_ins_lidar: Array | None, expected_ns: int | None, search_s: float
+) -> _Peak:
+    cutoff = min(8.0, 0.45 * ins.rate_hz)
+    lidar_start, a = _on_grid(lidar, cutoff)
+    ins_start, b = _on_grid(ins, cutoff)
+    for track, grid in ((lidar, a), (ins, b)):
+        rms = float(np.sqrt((grid**2).sum(axis=1).mean()))
+        if rms < LEAST_MOTION_RAD_S:
+            raise SyncError(
+                f"gyro of {track.name}: {np.rad2deg(rms):.2f} deg/s rms above {HIGH_PASS_HZ} Hz, expected at least "
+                f"{np.rad2deg(LEAST_MOTION_RAD_S):.1f}; there is no motion to correlate"
+            )
+    cross, energy, overlap = _cross_correlation(a, b)
+    # lag k of the arrays: b[i + k] goes with a[i]
+    lags = np.arange(-(len(a) - 1), len(b))
+    step_ns = round(NS_PER_S / GRID_HZ)
+    offsets = ins_start - lidar_start + lags * step_ns
+    usable = overlap >= min(LEAST_OVERLAP_S * GRID_HZ, 0.9 * min(len(a), len(b)))
+    if expected_ns is not None:
+        usable &= np.abs(offsets - expected_ns) <= search_s * NS_PER_S
+    if not usable.any():
+        where = "" if expected_ns is None else f" within {search_s:.0f} s of what the receive times say"
+        raise SyncError(f"gyros of {lidar.name} and {ins.name}: no shift{where} overlaps by {LEAST_OVERLAP_S:.0f} s")
+    cross, energy, offsets, overlap = cross[usable], energy[usable], offsets[usable], overlap[usable]
+    singular = np.linalg.svd(cross, compute_uv=False)
+    score = singular.sum(axis=1) / np.maximum(energy, 1e-3 * energy.max())
+    best = int(np.argmax(score))
+    away = np.abs(offsets - offsets[best]) > NS_PER_S
+    rival = float(score[away].max()) if away.any() else 0.0
+    independent = overlap[best] / GRID_HZ * 2 * MOTION_HZ
+    odds = 0.5 * independent * np.log((1 - min(rival, 1.0) ** 2 + 1e-9) / (1 - min(score[best], 1.0) ** 2 + 1e-9))
+    return _Peak(
+        int(offsets[best]),
+        float(score[best]),
+        rival,
+        float(odds),
+        _rotation(cross[best], mat_ins_lidar),
+        (offsets.astype(np.float64), score),
+    )
+
+
+def _on_grid(track: GyroTrack, cutoff_hz: float) -> tuple[int, Array]:
+    """Band-passed rates on the 100 Hz grid, and the time of its first point; silences are zero."""
+    start = int(track.time_ns[0])
+    seconds = (track.time_ns - start) * 1e-9
+    if len(seconds) < 8 or seconds[-1] < LEAST_OVERLAP_S:
+        raise SyncError(
+            f"gyro of {track.name}: {len(seconds)} samples in {seconds[-1] if len(seconds) else 0:.1f} s, "
+            f"expected at least {LEAST_OVERLAP_S:.0f} s"
+        )
+    grid = np.arange(0.0, seconds[-1], 1.0 / GRID_HZ)
+    fast = track.rate_hz > 2 * GRID_HZ
+    interpolant = None if fast else CubicSpline(seconds, track.rate_rad_s, axis=0)
+    values = _smooth(track, cutoff_hz, grid) if interpolant is None else interpolant(grid)
+    before = np.clip(np.searchsorted(seconds, grid, side="right") - 1, 0, len(seconds) - 2)
+    gap = np.maximum(1.0, 6.0 / max(track.rate_hz, 0.1))
+    silent = seconds[before + 1] - seconds[before] > gap
+    values[silent] = np.median(track.rate_rad_s, axis=0)
+    band = signal.butter(2, [HIGH_PASS_HZ, cutoff_hz], "bandpass", fs=GRID_HZ, output="sos")
+    values = signal.sosfiltfilt(band, values - np.median(values, axis=0), axis=0)
+    values[silent] = 0.0
+    return start, values
+
+
+def _cross_correlation(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Sums over i of b[i + k] a[i]^T, shape (lags, 3, 3), the norms they could reach, and the number of terms."""
+    size = fft.next_fast_len(len(a) + len(b) - 1, real=True)
+    order = np.concatenate([np.arange(size - len(a) + 1, size), np.arange(len(b))])
+
+    def correlate(x: Array, y: Array) -> Array:
+        spectrum = np.conj(fft.rfft(x, size, axis=0))[:, None, :] * fft.rfft(y, size, axis=0)[:, :, None]
+        return np.asarray(fft.irfft(spectrum, size, axis=0)[order])
+
+    ones_a, ones_b = np.ones((len(a), 1)), np.ones((len(b), 1))
+    energy_a = correlate((a**2).sum(axis=1, keepdims=True), ones_b)[:, 0, 0]
+    energy_b = correlate(ones_a, (b**2).sum(axis=1, keepdims=True))[:, 0, 0]
+    norm = np.sqrt(np.maximum(energy_a, 0.0) * np.maximum(energy_b, 0.0))
+    lags = np.arange(-(len(a) - 1), len(b))
+    overlap = np.minimum(len(a), len(b) - lags) - np.maximum(0, -lags)
+    return correlate(a, b), norm, overlap
+
+
+def _rotation(cross: Array, mat_ins_lidar: Array | None) -> Array:
+    """The orthogonal matrix that fits a cross-correlation best; the mount's where the motion cannot tell.
+
+    A reflection is kept if the data insist: then a gyro axis has the opposite sign.
+    """
+    left, singular, right = np.linalg.svd(cross)
+    if singular[2] > 0.1 * singular[0]:
+        return np.asarray(left @ right)
+    if mat_ins_lidar is not None:
+        return mat_ins_lidar
+    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
+
+
+def _smooth(track: GyroTrack, cutoff_hz: float, at_s: Array) -> Array:
+    """Rates of a fast gyro, low-passed without delay (Gaussian), at times in seconds from its first sample."""
+    return np.asarray(_smooth_spline(track, cutoff_hz)(at_s))
+
+
+def _smooth_spline(track: GyroTrack, cutoff_hz: float) -> CubicSpline:
+    seconds = (track.time_ns - track.time_ns[0]) * 1e-9
+    grid = np.arange(0.0, seconds[-1] + 1.0 / FINE_HZ, 1.0 / FINE_HZ)
+    values = np.stack([np.interp(grid, seconds, axis) for axis in track.rate_rad_s.T], axis=1)
+    sigma = FINE_HZ * np.sqrt(np.log(2.0) / 2.0) / (np.pi * cutoff_hz)  # half power at the cut-off
+    return CubicSpline(grid, ndimage.gaussian_filter1d(values, sigma, axis=0, mode="nearest"), axis=0)
+
+
+# Least squares --------------------------------------------------------------------------------------------------------
+
+
+def _fit(lidar: GyroTrack, ins: GyroTrack, peak: _Peak, cutoff_hz: float, mat_mount: Array | None) -> Sync:
+    """Gauss-Newton on offset, drift and rotation, to the INS samples as they are; biases are projected out at every step.
+
+    Model of a sample at time t: rotation @ rate(t - offset - drift (t - mid)) + bias(t), rate being the smoothed fast gyro.
+    """
+    smooth = _smooth_spline(lidar, cutoff_hz)
+    slope = smooth.derivative()
+    time_s = (ins.time_ns - peak.offset_ns - lidar.time_ns[0]) * 1e-9
+    inside = (time_s > 0.5) & (time_s < (lidar.time_ns[-1] - lidar.time_ns[0]) * 1e-9 - 0.5)
+    time_s, rate = time_s[inside], ins.rate_rad_s[inside]
+    if len(time_s) < 30:
+        raise SyncError(f"gyros of {lidar.name} and {ins.name}: {len(time_s)} common samples, expected at least 30")
+    mid_s = 0.5 * (time_s[0] + time_s[-1])
+    unbias = _bias_projector(time_s)
+    rotation, shift = peak.mat_ins_lidar, np.zeros(2)  # offset [s], drift
+    # the prior on the rotation keeps an axis that hardly moved where the correlation, or the mount, put it
+    prior = np.array([0.0, (DRIFT_PRIOR_PPM * 1e-6) ** -2, *[ROTATION_PRIOR_RAD**-2] * 3])
+    for _ in range(20):
+        at = time_s - shift[0] - shift[1] * (time_s - mid_s)
+        turned, moved = smooth(at) @ rotation.T, slope(at) @ rotation.T
+        residual = unbias(rate - turned)
+        axes = np.eye(3)
+        columns = [-moved, -moved * (time_s - mid_s)[:, None], *(np.cross(axis, turned) for axis in axes)]
+        jacobian = np.stack([unbias(column) for column in columns], axis=-1)
+        weight = _weights(residual)
+        normal = np.einsum("nki,nk,nkj->ij", jacobian, weight, jacobian) + np.diag(prior)
+        score = np.einsum("nki,nk,nk->i", jacobian, weight, residual)
+        step = np.linalg.solve(normal, score - prior * np.array([0.0, shift[1], 0.0, 0.0, 0.0]))
+        shift = shift + step[:2]
+        rotation = Rotation.from_rotvec(step[2:]).as_matrix() @ rotation
+        if abs(step[0]) < 1e-7 and np.abs(step[2:]).max() < 1e-6:
+            break
+    covariance = _covariance(time_s, np.einsum("nki,nk,nk->ni", jacobian, weight, residual), normal)
+    angle = None
+    if mat_mount is not None:
+        angle = float(np.degrees(np.arccos(np.clip((np.trace(rotation @ mat_mount.T) - 1.0) / 2.0, -1.0, 1.0))))
+    reflected = np.linalg.det(rotation) < 0
+    return Sync(
+        method="gyro",
+        offset_ns=peak.offset_ns + round(shift[0] * NS_PER_S),
+        sigma_offset_ns=float(np.sqrt(covariance[0, 0]) * NS_PER_S),
+        reference_ns=int(lidar.time_ns[0]) + round((mid_s - shift[0]) * NS_PER_S),
+        drift_ppm=float(shift[1] * 1e6),
+        sigma_drift_ppm=float(np.sqrt(covariance[1, 1]) * 1e6),
+        peak=peak.height,
+        rival=peak.rival,
+        residual_rad_s=float(np.sqrt((residual**2).mean())),
+        samples=len(time_s),
+        mat_ins_lidar=rotation,
+        mount_angle_deg=angle,
+        note="the gyros fit only with one axis of the opposite sign" if reflected else "",
+        curve=peak.curve,
+    )
+
+
+def _bias_projector(time_s: Array) -> Callable[[Array], Array]:
+    """A function that takes from each axis, shape (n, 3), its best linear spline with knots `BIAS_KNOT_S` apart."""
+    span = time_s[-1] - time_s[0]
+    knots = max(2, round(span / BIAS_KNOT_S) + 1)
+    place = (time_s - time_s[0]) / span * (knots - 1)
+    left = np.minimum(place.astype(int), knots - 2)
+    rows = np.arange(len(time_s))
+    basis = sparse.csr_matrix(
+        (
+            np.concatenate([1.0 - (place - left), place - left]),
+            (np.concatenate([rows, rows]), np.concatenate([left, left + 1])),
+        ),
+        shape=(len(time_s), knots),
+    )
+    # the small ridge is for knots in a silence, which no sample sees
+    solve = factorized(sparse.csc_matrix(basis.T @ basis + 1e-6 * sparse.identity(knots)))
+
+    def unbias(values: Array) -> Array:
+        fitted = np.stack([solve(basis.T @ axis) for axis in values.T], axis=1)
+        return np.asarray(values - basis @ fitted)
+
+    return unbias
+
+
+def _weights(residual: Array) -> Array:
+    """Huber weights over each axis' own variance, shape (n, 3)."""
+    scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-6)
+    normed = np.abs(residual) / scale
+    return np.asarray(np.where(normed > 1.5, 1.5 / np.maximum(normed, 1.5), 1.0) / scale**2)
+
+
+def _covariance(time_s: Array, scores: Array, normal: Array) -> Array:
+    """Covariance of the five unknowns that holds for residuals correlated in time (sandwich over blocks of time).
+
+    `scores` has shape (n, 5): what each sample, all its axes, adds to the right-hand side. The plain inverse, which takes every
+    residual for independent, is the least that is stated.
+    """
+    block = ((time_s - time_s[0]) / BLOCK_S).astype(int)
+    sums = np.stack([np.bincount(block, column) for column in scores.T], axis=1)
+    used = np.bincount(block) > 0
+    blocks = int(used.sum())
+    plain = np.linalg.inv(normal)
+    if blocks < 10:
+        return np.asarray(plain * 4.0)  # too few blocks to learn the correlation from
+    spread = sums[used].T @ sums[used] * (blocks / (blocks - 5.0))
+    robust = plain @ spread @ plain
+    factor = np.sqrt(np.maximum(np.diag(robust) / np.diag(plain), 1.0))
+    return np.asarray(plain * np.outer(factor, factor))

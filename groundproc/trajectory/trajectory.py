@@ -1,0 +1,247 @@
+"""A trajectory: knots of position and attitude with their sigmas, and poses at any time that they cover.
+
+Between knots the position is a cubic through both ends with their velocities, and the attitude the same in the rotation vector from
+knot to knot with the body rates at both ends (a cumulative cubic Hermite spline on SO(3)): continuous in rate, and local, so that one
+bad knot disturbs its two neighbours and nothing else.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from flightlog.clock import utc_text
+from flightlog.errors import CoverageError
+from groundproc.geodesy import LocalFrame
+
+Array = npt.NDArray[np.float64]
+
+SMOOTH: Final = "cubic"
+HOLD: Final = "hold"
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses at asked times.
+
+    Attributes
+    ----------
+    position_m : ndarray, shape (n, 3)
+        INS origin in the local frame (east, north, up).
+    quat_local_ins_wxyz : ndarray, shape (n, 4)
+    """
+
+    position_m: Array
+    quat_local_ins_wxyz: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Knots of a trajectory, in time order.
+
+    Attributes
+    ----------
+    frame : LocalFrame
+        The local frame of the positions.
+    time_ns : ndarray of int64, shape (n,)
+        UTC, strictly increasing.
+    position_m, velocity_m_s : ndarray, shape (n, 3)
+        INS origin, east, north, up.
+    quat_local_ins_wxyz : ndarray, shape (n, 4)
+    rate_rad_s : ndarray, shape (n, 3)
+        Body rate in the ins frame.
+    sigma_position_m : ndarray, shape (n, 3)
+        Standard deviation east, north, up.
+    sigma_attitude_rad : ndarray, shape (n, 3)
+        Standard deviation of roll, pitch, heading.
+    covered : ndarray of bool, shape (n,)
+        Whether the interval from each knot to the next is covered; False for the last.
+    interpolation : str
+        "cubic", or "hold": the nearest knot's pose, as the source does on its 10 ms grid.
+    """
+
+    frame: LocalFrame
+    time_ns: npt.NDArray[np.int64]
+    position_m: Array
+    velocity_m_s: Array
+    quat_local_ins_wxyz: Array
+    rate_rad_s: Array
+    sigma_position_m: Array
+    sigma_attitude_rad: Array
+    covered: npt.NDArray[np.bool_]
+    interpolation: str = SMOOTH
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def part(self, chosen: slice) -> "Trajectory":
+        """The knots of a slice; the last one's interval is no longer covered."""
+        arrays = {name: getattr(self, name)[chosen] for name in _ARRAYS}
+        covered = arrays["covered"].copy()
+        covered[-1:] = False
+        return replace(self, **arrays | {"covered": covered})
+
+    def before(self, time_ns: int) -> "Trajectory":
+        """The knots up to a time [ns]."""
+        return self.part(slice(None, int(np.searchsorted(self.time_ns, time_ns, side="right"))))
+
+    def after(self, time_ns: int) -> "Trajectory":
+        """The knots later than a time [ns]."""
+        return self.part(slice(int(np.searchsorted(self.time_ns, time_ns, side="right")), None))
+
+    def where_covered(self, time_ns: npt.NDArray[np.int64]) -> tuple[Poses, npt.NDArray[np.bool_]]:
+        """Poses at times, shape (n,), and which of them are covered; a pose that is not is left empty.
+
+        Any order will do; time order is fastest.
+        """
+        times = np.ascontiguousarray(time_ns, np.int64)
+        position, quat = np.empty((len(times), 3)), np.empty((len(times), 4))
+        covered = np.zeros(len(times), np.bool_)
+        _interpolate(
+            self.time_ns,
+            self.covered,
+            self.position_m,
+            self.velocity_m_s,
+            self.quat_local_ins_wxyz,
+            self.rate_rad_s,
+            self.interpolation == HOLD,
+            times,
+            position,
+            quat,
+            covered,
+        )
+        return Poses(position, quat), covered
+
+    def at(self, time_ns: npt.NDArray[np.int64]) -> Poses:
+        """Poses at times, shape (n,).
+
+        Raises
+        ------
+        CoverageError
+            A time outside the covered intervals: there is no extrapolation.
+        """
+        poses, covered = self.where_covered(time_ns)
+        if not covered.all():
+            first = int(np.asarray(time_ns)[~covered][0])
+            raise CoverageError(
+                f"trajectory: no pose at {utc_text(first)}; it covers {utc_text(int(self.time_ns[0]))} to "
+                f"{utc_text(int(self.time_ns[-1]))}, less its gaps"
+            )
+        return poses
+
+
+_ARRAYS: Final = (
+    "time_ns", "position_m", "velocity_m_s", "quat_local_ins_wxyz", "rate_rad_s", "sigma_position_m", "sigma_attitude_rad", "covered",
+)  # fmt: skip
+
+
+def joined(parts: Sequence[Trajectory]) -> Trajectory:
+    """Trajectories of one frame as one, in the order of their times; what lies between them is not covered.
+
+    Raises
+    ------
+    CoverageError
+        There is none, or they overlap.
+    """
+    if not parts:
+        raise CoverageError("trajectory: no part of it has two poses")
+    parts = sorted(parts, key=lambda part: int(part.time_ns[0]))
+    for first, second in itertools.pairwise(parts):
+        if second.time_ns[0] <= first.time_ns[-1]:
+            raise CoverageError(
+                f"trajectory: a part ends at {utc_text(int(first.time_ns[-1]))} and the next begins at "
+                f"{utc_text(int(second.time_ns[0]))}, expected later"
+            )
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    return replace(parts[0], **arrays)
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(
+    knots: Any,
+    covered: Any,
+    position: Any,
+    velocity: Any,
+    quat: Any,
+    rate: Any,
+    hold: bool,
+    times: Any,
+    out_position: Any,
+    out_quat: Any,
+    out_covered: Any,
+) -> None:
+    last = len(knots) - 2
+    i = -1
+    delta, slope, vector = np.empty(3), np.empty(3), np.empty(3)
+    for k in range(len(times)):
+        t = times[k]
+        if last < 0 or t < knots[0] or t > knots[last + 1]:
+            continue
+        if i < 0 or t < knots[i] or t >= knots[i + 1]:
+            # what follows in time order is in the same interval or the next
+            if 0 <= i < last and knots[i + 1] <= t < knots[i + 2]:
+                i += 1
+            else:
+                i = min(max(np.searchsorted(knots, t, side="right") - 1, 0), last)
+            _relative_rotation(quat[i], quat[i + 1], delta)
+            # rate of the rotation vector at the end: the inverse right Jacobian, to second order in the step
+            w = rate[i + 1]
+            slope[0] = w[0] + 0.5 * (delta[1] * w[2] - delta[2] * w[1])
+            slope[1] = w[1] + 0.5 * (delta[2] * w[0] - delta[0] * w[2])
+            slope[2] = w[2] + 0.5 * (delta[0] * w[1] - delta[1] * w[0])
+        if not covered[i]:
+            continue
+        out_covered[k] = True
+        if hold:
+            nearest = i if t - knots[i] <= knots[i + 1] - t else i + 1
+            out_position[k], out_quat[k] = position[nearest], quat[nearest]
+            continue
+        span = (knots[i + 1] - knots[i]) * 1e-9
+        u = (t - knots[i]) * 1e-9 / span
+        h10 = u * (1 - u) * (1 - u) * span
+        h01 = u * u * (3 - 2 * u)
+        h11 = u * u * (u - 1) * span
+        for axis in range(3):
+            out_position[k, axis] = (
+                (1 - h01) * position[i, axis]
+                + h01 * position[i + 1, axis]
+                + h10 * velocity[i, axis]
+                + h11 * velocity[i + 1, axis]
+            )
+            vector[axis] = h01 * delta[axis] + h10 * rate[i, axis] + h11 * slope[axis]
+        _rotate_on(quat[i], vector, out_quat[k])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _relative_rotation(q: Any, r: Any, out: Any) -> None:
+    """Rotation vector from attitude q to attitude r, in the body of q: log(q^-1 r), the short way."""
+    w = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
+    x = q[0] * r[1] - q[1] * r[0] - q[2] * r[3] + q[3] * r[2]
+    y = q[0] * r[2] + q[1] * r[3] - q[2] * r[0] - q[3] * r[1]
+    z = q[0] * r[3] - q[1] * r[2] + q[2] * r[1] - q[3] * r[0]
+    sine = np.sqrt(x * x + y * y + z * z)
+    factor = 2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, abs(w)) / sine
+    if w < 0:
+        factor = -factor
+    out[0], out[1], out[2] = factor * x, factor * y, factor * z
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _rotate_on(q: Any, vector: Any, out: Any) -> None:
+    """Attitude q turned on by a rotation vector in its body: q exp(vector)."""
+    square = 0.25 * (vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    if square < 0.01:  # half angles under 0.1 rad: five terms are exact to 1e-16
+        w = 1 - square / 2 * (1 - square / 12 * (1 - square / 30 * (1 - square / 56)))
+        factor = 0.5 * (1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72))))
+    else:
+        half = np.sqrt(square)
+        w, factor = np.cos(half), 0.5 * np.sin(half) / half
+    x, y, z = factor * vector[0], factor * vector[1], factor * vector[2]
+    out[0] = q[0] * w - q[1] * x - q[2] * y - q[3] * z
+    out[1] = q[0] * x + q[1] * w + q[2] * z - q[3] * y
+    out[2] = q[0] * y - q[1] * z + q[2] * w + q[3] * x
+    out[3] = q[0] * z + q[1] * y - q[2] * x + q[3] * w
