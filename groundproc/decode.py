@@ -179,11 +179,20 @@ def decode(
     elevation = np.stack([np.cos(lasers.elevation_rad), np.sin(lasers.elevation_rad), lasers.range_offset_m])
     kernel = _decode_dual if dual else _decode_single
     count = kernel(raw, time_ns, elevation, *(gate or Gate()).steps(), out)
-    return Shots(*(array[:count] for array in out))
+    stamps, xyz, azimuth, ranges, intensity, laser, returns = out
+    return Shots(
+        stamps[:count],
+        xyz[:count],
+        azimuth[:count],
+        ranges[:count],
+        intensity[:count],
+        laser[:count],
+        returns[:count],
+    )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def u16(raw: Any, packet: int, offset: int) -> int:
+def u16(raw: Any, packet: int, offset: int) -> Any:
     """Little-endian 16-bit word of a packet."""
     return np.int64(raw[packet, offset]) | (np.int64(raw[packet, offset + 1]) << 8)
 
@@ -237,7 +246,7 @@ def block_is_outside(azimuth: float, step: float, start: float, width: float) ->
 
 
 @njit(cache=True, nogil=True, inline="always")
-def pair_returns(row: Any, last: int, other: int, low: int, high: int) -> tuple[int, int, int]:
+def pair_returns(row: Any, last: int, other: int, low: int, high: int) -> Any:
     """The returns of one laser in dual return mode: place of the nearer, place of the farther, how many (0 to 2).
 
     The even block holds the last return at `last`, the odd one the strongest at `other`, or the second strongest where the
@@ -258,7 +267,7 @@ def pair_returns(row: Any, last: int, other: int, low: int, high: int) -> tuple[
 
 @njit(cache=True, nogil=True, inline="always")
 def _put(
-    out: Any, count: int, time_ns: int, x: float, y: float, z: float, azimuth: float, range_steps: int, laser: int
+    out: Any, count: int, time_ns: int, x: float, y: float, z: float, azimuth: float, range_steps: Any, laser: int
 ) -> None:
     """Write what both return modes share of shot number `count`."""
     out[0][count] = time_ns

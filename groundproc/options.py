@@ -12,12 +12,10 @@ def field_of_view(text: str) -> tuple[float, float]:
     words = text.split(":") if ":" in text else text.rsplit("-", 1)
     try:
         start, end = (float(word) for word in words)
-        if not (-360.0 <= start <= 360.0 and -360.0 <= end <= 360.0):
-            raise ValueError
     except ValueError:
-        raise UsageError(
-            f"--fov {text!r}: expected two azimuths such as 255-105 or -105:105, in degrees, or all"
-        ) from None
+        start = end = math.nan
+    if not (-360.0 <= start <= 360.0 and -360.0 <= end <= 360.0):
+        raise UsageError(f"--fov {text!r}: expected two azimuths such as 255-105 or -105:105, in degrees, or all")
     return start, end
 
 

@@ -117,7 +117,7 @@ def _write(
     events = heapq.merge(*streams, key=attrgetter("time_ns"))
     first = next(events, None)
     joiner = Joiner()
-    session = {"origin": "import", "software": f"swath {__version__}"}
+    session = {"origin": "import", "version": __version__}
     writer = LogWriter(
         stream, metadata={"swath.session": session}, attachments=attachments, library=f"swath {__version__}"
     )

@@ -30,7 +30,9 @@ def _size(count: int) -> str:
 def _log(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if summary["start_utc"]:
         yield "recorded", f"{summary['start_utc']} to {summary['end_utc']} by the recording computer"
-    yield "made by", summary["session"].get("software", "unknown")
+    session = summary["session"]
+    if "version" in session:
+        yield "made by", f"swath {session['version']}, {{'import': 'imported', 'simulation': 'simulated'}.get(session.get('origin', ''), 'recorded')}"
     damage = summary["damage"]
     state = "cut off: the recorder did not finish it" if summary["truncated"] else "whole"
     if damage["bad_chunks"] or damage["lost_bytes"]:

@@ -156,7 +156,7 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
                 f"trajectory: a part ends at {utc_text(int(first.time_ns[-1]))} and the next begins at "
                 f"{utc_text(int(second.time_ns[0]))}, expected later"
             )
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
     return replace(parts[0], **arrays)
 
 
