@@ -55,10 +55,8 @@ def clocks(options: ClockOptions) -> Clocks:
     if start.tzinfo is None:
         start = start.replace(tzinfo=UTC)
     utc_ns = int(start.timestamp()) * NS_PER_S + start.microsecond * 1000
-    if options.lidar_gps:
-        lidar = Clock(utc_ns % (3600 * NS_PER_S))
-    else:
-        lidar = Clock(round(options.lidar_on_s * NS_PER_S), options.lidar_drift_ppm)
+    free = Clock(round(options.lidar_on_s * NS_PER_S), options.lidar_drift_ppm)
+    lidar = Clock(utc_ns % (3600 * NS_PER_S)) if options.lidar_gps else free
     return Clocks(
         utc=Clock(utc_ns),
         host=Clock(utc_ns + round(options.host_error_s * NS_PER_S), options.host_drift_ppm),

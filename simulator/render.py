@@ -173,9 +173,9 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
     """
     names = [LOG, CAPTURE, TLOG, POSES, TRUTH] + [POINTS] * job.truth_points
     parts = {name: job.directory / f"{name}.part" for name in names}
+    simulation = Simulation(job)
     try:
         job.directory.mkdir(parents=True, exist_ok=True)
-        simulation = Simulation(job)
         try:
             with Recording(simulation, parts) as recording:
                 for chunk, sweep in enumerate(in_order(simulation, job.workers)):

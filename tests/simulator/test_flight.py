@@ -37,7 +37,7 @@ def test_specific_force_is_acceleration_plus_gravity_in_the_body(flight):
     time_s = np.arange(1.0, 30.0, 0.01)
     position = [flight.poses(time_s + d).position_m for d in (-0.002, 0.0, 0.002)]
     acceleration = (position[0] - 2 * position[1] + position[2]) / 0.002**2
-    force = rotations(flight, time_s).inv().apply(acceleration + [0, 0, 9.80665])
+    force = rotations(flight, time_s).inv().apply(acceleration + np.array([0, 0, 9.80665]))
     assert np.abs(force - flight.specific_force_m_s2(time_s)).max() < 0.01
 
 
