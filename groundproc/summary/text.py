@@ -31,8 +31,9 @@ def _log(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if summary["start_utc"]:
         yield "recorded", f"{summary['start_utc']} to {summary['end_utc']} by the recording computer"
     session = summary["session"]
-    if "version" in session:
-        yield "made by", f"swath {session['version']}, {{'import': 'imported', 'simulation': 'simulated'}.get(session.get('origin', ''), 'recorded')}"
+    program = session.get("software") or (f"swath {session['version']}" if "version" in session else "")
+    made = {"import": "imported", "simulate": "simulated"}.get(session.get("origin", ""), "recorded")
+    yield "made by", f"{program or 'an unknown program'}, {made}"
     damage = summary["damage"]
     state = "cut off: the recorder did not finish it" if summary["truncated"] else "whole"
     if damage["bad_chunks"] or damage["lost_bytes"]:

@@ -295,7 +295,7 @@ def test_a_mount_travels_with_the_log_and_a_wrong_one_is_refused(
 )
 def test_what_is_no_autopilot_recording_is_refused(
     small: Path,
-    recordings: Path,
+    request: pytest.FixtureRequest,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     name: str,
@@ -303,7 +303,7 @@ def test_what_is_no_autopilot_recording_is_refused(
     sentence: str,
 ) -> None:
     if content is None:
-        stamped = (recordings / "mavlink/ardusub_2023.tlog").read_bytes()
+        stamped = (request.getfixturevalue("recordings") / "mavlink/ardusub_2023.tlog").read_bytes()
         content, offset = b"", 0
         while len(content) < 5000:
             size = 12 + stamped[offset + 9]
