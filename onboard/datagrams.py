@@ -133,13 +133,19 @@ class Receiver:
 
     def _note(self, part: slice) -> None:
         messages, control = self._messages[part], self._control[part]
-        cut = messages["flags"] & socket.MSG_TRUNC != 0
-        self.sizes[part] = np.where(cut, self._limit + 1, messages["size"])
-        stamped = messages["control_size"] >= _WITH_TIME
-        self.stamps_ns[part] = np.where(stamped, control["sec"] * NS_PER_S + control["nanosec"], 0)
-        if messages["control_size"][-1] >= _WITH_DROPS:
+        self.sizes[part] = messages["size"]
+        cut = messages["flags"] & socket.MSG_TRUNC
+        if cut.any():
+            self.sizes[part][cut != 0] = self._limit + 1
+        control_size = messages["control_size"]
+        stamps_ns = control["sec"] * NS_PER_S
+        stamps_ns += control["nanosec"]
+        if control_size.min() < _WITH_TIME:
+            stamps_ns[control_size < _WITH_TIME] = 0
+        self.stamps_ns[part] = stamps_ns
+        if control_size[-1] >= _WITH_DROPS:
             self._count_drops(int(control["drops"][-1]))
-        messages["control_size"] = _CONTROL_DTYPE.itemsize
+        control_size[:] = _CONTROL_DTYPE.itemsize
 
     def count_last_drops(self) -> None:
         """Ask the kernel for drops that no later datagram has told of."""

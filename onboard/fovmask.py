@@ -97,10 +97,22 @@ def blocks_inside(
     """
     start = azimuth.astype(np.int32)
     past = (start - window.start) % AZIMUTH_STEPS
+    inside = np.asarray(past <= window.width)
+    # Only a block just ahead of the window can turn into it; most packets have none.
+    near = (past > AZIMUTH_STEPS - LARGEST_STEP - 1).any(axis=1)
+    if near.any():
+        inside[near] |= _turns_in(start[near], return_mode[near], past[near])
+    return inside
+
+
+def _turns_in(
+    start: npt.NDArray[np.int32], return_mode: npt.NDArray[np.uint8], past: npt.NDArray[np.int32]
+) -> npt.NDArray[np.bool_]:
+    """Which blocks reach the start of the window with their last shot; `past` is how far past that start they begin."""
     step = azimuth_step(start, return_mode)[:, None]
     # The last shot's azimuth, start + step * _LAST_SHOT_NS / FIRING_NS, rounded to 0.01 deg as a decoder does, in whole numbers.
     last_past = past + (2 * _LAST_SHOT_NS * step + FIRING_NS) // (2 * FIRING_NS)
-    return np.asarray((past <= window.width) | (last_past >= AZIMUTH_STEPS))
+    return np.asarray(last_past >= AZIMUTH_STEPS)
 
 
 def azimuth_step(azimuth: npt.NDArray[np.int32], return_mode: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:

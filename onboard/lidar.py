@@ -129,7 +129,7 @@ class LidarPort(Worker):
                 self.progress()
                 if self.progress_ns >= position_due_ns:
                     self._poll(self._position, self._close_position)
-                    position_due_ns = self.progress_ns + BATCH_NS
+                    position_due_ns = self.progress_ns + BATCH_NS // 2
                 time.sleep(_BUSY_POLL_S if busy else self._poll_s)
             self._poll(self._data, self._close_data)
             self._poll(self._position, self._close_position)
