@@ -55,10 +55,12 @@ class Run:
 
     @property
     def cpu_s_per_million(self) -> float:
+        """CPU seconds for a million packets."""
         return self.cpu_s / self.sent * 1e6
 
     @property
     def loss(self) -> float:
+        """Share of the packets sent that were not logged."""
         return 1.0 - self.logged / self.sent
 
 
@@ -175,6 +177,7 @@ def send(rate: float, seconds: float, port: int, *, dual: bool = False, mavlink_
 
 
 def free_port() -> int:
+    """Find a UDP port that nobody has."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((ADDRESS, 0))
         return int(sock.getsockname()[1])
@@ -189,6 +192,7 @@ def cpu_s(pid: int) -> float:
 
 
 def peak_memory_mb(pid: int) -> float:
+    """Highest resident memory of a process so far."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
@@ -214,6 +218,7 @@ def recorder(command: list[str], settle_s: float = 1.5) -> Iterator[subprocess.P
 
 
 def measure(process: subprocess.Popen[bytes], sending: Callable[[], tuple[int, float]]) -> Run:
+    """Send to a recorder that runs, and see what it costs."""
     before = cpu_s(process.pid)
     sent, seconds = sending()
     time.sleep(0.7)  # what is still in buffers is part of the work
@@ -223,6 +228,7 @@ def measure(process: subprocess.Popen[bytes], sending: Callable[[], tuple[int, f
 def run_swathd(
     folder: Path, rate: float, seconds: float, *, fov: bool, dual: bool = False, mavlink: bool = False
 ) -> Run:
+    """One run of the daemon."""
     port, mavlink_port = free_port(), free_port()
     logs = folder / "swathd"
     shutil.rmtree(logs, ignore_errors=True)
@@ -248,6 +254,7 @@ def run_swathd(
 
 
 def run_tcpdump(folder: Path, rate: float, seconds: float) -> Run | None:
+    """One run of tcpdump with a buffer as large as ours, None where it cannot capture."""
     program = shutil.which("tcpdump") or shutil.which("tcpdump", path="/usr/sbin:/usr/bin")
     if program is None:
         print("tcpdump is not installed; no ratio to it")
@@ -270,6 +277,7 @@ def run_tcpdump(folder: Path, rate: float, seconds: float) -> Run | None:
 
 
 def run_recvfrom(folder: Path, rate: float, seconds: float) -> Run:
+    """One run of the loop below."""
     port = free_port()
     log = folder / "recvfrom.mcap"
     with recorder([sys.executable, __file__, "--recvfrom", str(log), f"--port={port}"]) as process:
@@ -280,7 +288,7 @@ def run_recvfrom(folder: Path, rate: float, seconds: float) -> Run:
 
 
 def recvfrom_main(options: argparse.Namespace) -> None:
-    """The recorder that one would write first: a call, a time and a message for each packet."""
+    """Be the recorder that one would write first: a call, a time and a message for each packet."""
     running = True
 
     def stop(number: int, frame: object) -> None:
@@ -308,6 +316,7 @@ def recvfrom_main(options: argparse.Namespace) -> None:
 
 
 def say(name: str, run: Run) -> None:
+    """Print one run."""
     print(
         f"{name:34} {run.sent / run.seconds:7.0f} packets/s  {run.cpu_s_per_million:6.2f} CPU s per million  "
         f"{100 * run.cpu_s / run.seconds:5.2f} % of a core  lost {100 * run.loss:.3f} %",
@@ -316,6 +325,7 @@ def say(name: str, run: Run) -> None:
 
 
 def main() -> None:
+    """Run the benchmark, or the part of it that a process of its own plays."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=8.0, help="of one run")
@@ -336,6 +346,7 @@ def main() -> None:
 
 
 def benchmark(folder: Path, rounds: int, seconds: float) -> dict[str, float | None]:
+    """Run all recorders in turn."""
     ours: list[Run] = []
     tcpdump: list[Run] = []
     recvfrom: list[Run] = []
@@ -369,6 +380,7 @@ def benchmark(folder: Path, rounds: int, seconds: float) -> dict[str, float | No
 
 
 def median_cost(runs: list[Run]) -> float:
+    """CPU seconds per million packets, the median of some runs."""
     return statistics.median(run.cpu_s_per_million for run in runs)
 
 

@@ -5,7 +5,6 @@ damaged byte, and a log from a crash is the one that matters most.
 """
 
 import struct
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -13,18 +12,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, NamedTuple, Self
 
-import lz4.frame
-import zstandard
 from mcap.writer import CompressionType, Writer
 
+from flightlog import container
+from flightlog.container import DAMAGE, MAGIC, RECORD_HEAD, Opcode
 from flightlog.errors import LogError
 from flightlog.records import FORMAT_VERSION, record_type
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
-_ATTACHMENT, _METADATA, _DATA_END = 0x09, 0x0C, 0x0F
-_LAST_OPCODE: Final = 0x0F
-_LARGEST_CHUNK: Final = 256 * 2**20
+_TOPICS: Final = "swath.topics"
 
 _QOS: Final = (
     "- history: 1\n  depth: 10\n  reliability: 1\n  durability: 2\n"
@@ -75,6 +70,7 @@ class LogWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._sequence: dict[int, int] = {}
+        self._flushes = 0
         self.add_metadata("swath.log", {"format_version": str(FORMAT_VERSION)})
         for name, values in metadata.items():
             self.add_metadata(name, values)
@@ -108,7 +104,14 @@ class LogWriter:
         self._writer.add_message(channel, log_time_ns, data, log_time_ns, self._sequence[channel])
 
     def flush(self) -> None:
-        """Close the open chunk and hand everything to the stream, which is flushed too. Syncing to the disk is the caller's."""
+        """Close the open chunk and hand everything to the stream, which is flushed too. Syncing to the disk is the caller's.
+
+        What channel number means which topic stands in the first chunk and in the summary only. So that a log without summary
+        survives the loss of that chunk, it is said again as metadata at the flushes number 1, 2, 4, 8 and so on.
+        """
+        self._flushes += 1
+        if self._channels and self._flushes & (self._flushes - 1) == 0:
+            self.add_metadata(_TOPICS, {str(number): topic for topic, number in self._channels.items()})
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self) -> None:
@@ -169,7 +172,7 @@ class LogReader:
     Raises
     ------
     LogError
-        No such file, no MCAP file, or a log of a newer format.
+        No such file, no MCAP file, one with messages outside of chunks, or a log of a newer format.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -179,6 +182,8 @@ class LogReader:
         self.damage = Damage()
         self._chunks: list[_Chunk] = []
         self._topics: dict[int, str] = {}
+        self._bad: set[int] = set()
+        self._in_summary = False
         try:
             self._file = self.path.open("rb")
         except OSError as error:
@@ -229,181 +234,183 @@ class LogReader:
         progress : callable, optional
             Called with the number of file bytes done since the last call.
         """
-        bad_before = self.damage.bad_chunks
         done = 0
         for chunk in self._chunks:
-            content = self._read_chunk(chunk, count=bad_before == 0)
+            content = self._read_chunk(chunk)
             if content is not None:
-                yield from self._messages(content, topics)
+                yield from self._messages(chunk, content, topics)
             if progress is not None:
                 progress(chunk.offset + chunk.size - done)
                 done = chunk.offset + chunk.size
+        if progress is not None:
+            progress(self._size - done)
 
     # Skimming -----------------------------------------------------------------------------------------------------
 
     def _skim(self) -> None:
         self._size = self.path.stat().st_size
-        if self._file.read(len(MAGIC)) != MAGIC:
+        if self._read(0, len(MAGIC)) != MAGIC:
             raise LogError(f"{self.path}: is no MCAP file (its first bytes are not {MAGIC!r})")
-        offset, complete = len(MAGIC), False
-        while offset < self._size:
-            size = self._record_at(offset)
-            if size is None:
-                following = self._next_chunk(offset + 1)
+        tail = self._read(max(0, self._size - container.FOOTER_BYTES), container.FOOTER_BYTES)
+        summary = container.footer(tail)
+        self.damage.truncated = summary is None
+        end = self._size if summary is None else self._size - container.FOOTER_BYTES
+        offset = len(MAGIC)
+        while offset < end:
+            following = self._take(offset, end)
+            if following is None:
+                following = self._step_over(offset, end, summary or end)
                 self.damage.note(offset, following - offset, "no valid record")
-                offset = following
-                continue
-            opcode = self._opcode(offset)
-            if opcode == _FOOTER:
-                self._file.seek(-len(MAGIC), 2)
-                complete = self._file.read(len(MAGIC)) == MAGIC
-                break
-            self._take(opcode, offset, size)
-            offset += 9 + size
-        self.damage.truncated = not complete
+            offset = following
+        if self._loose and not self._chunks and not self.metadata:
+            raise LogError(f"{self.path}: holds messages outside of chunks, which no flight log does")
 
-    def _opcode(self, offset: int) -> int:
+    def _read(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
-        return self._file.read(1)[0]
+        return self._file.read(size)
 
-    def _record_at(self, offset: int) -> int | None:
-        """Size of the record's content, None where no record can start."""
-        self._file.seek(offset)
-        head = self._file.read(9)
-        if len(head) < 9:
+    def _take(self, offset: int, end: int) -> int | None:
+        """Keep what an opened log must know of the record at `offset`; give the place behind it, None for no valid record."""
+        head = self._read(offset, RECORD_HEAD.size + container.CHUNK_HEAD_BYTES)
+        if len(head) < RECORD_HEAD.size:
             return None
-        opcode, size = struct.unpack("<BQ", head)
-        if not _HEADER <= opcode <= _LAST_OPCODE or offset + 9 + size > self._size:
+        opcode, size = RECORD_HEAD.unpack_from(head)
+        following = offset + RECORD_HEAD.size + int(size)
+        if following > end:
             return None
-        return int(size)
+        head = head[RECORD_HEAD.size :]
+        try:
+            if opcode == Opcode.CHUNK:
+                start_ns, end_ns, *_ = container.chunk_head(head, size)
+                self._chunks.append(_Chunk(offset, following - offset, start_ns, end_ns))
+            elif opcode == Opcode.MESSAGE_INDEX:
+                return following if container.is_message_index(head, size) else None
+            elif opcode == Opcode.MESSAGE:
+                self._loose = True  # a damaged opcode in our logs; others may write whole files so
+                return None
+            elif opcode in container.SUMMARY_ONLY:
+                return following if self._in_summary else None
+            else:
+                self._keep(opcode, self._read(offset + RECORD_HEAD.size, size))
+        except DAMAGE:
+            return None
+        return following
 
-    def _take(self, opcode: int, offset: int, size: int) -> None:
-        """Keep what an opened log must know of a top-level record."""
-        self._file.seek(offset + 9)
-        if opcode == _CHUNK:
-            start_ns, end_ns = struct.unpack("<QQ", self._file.read(16))
-            self._chunks.append(_Chunk(offset, 9 + size, start_ns, end_ns))
-        elif opcode == _CHANNEL:  # in the summary: saves a log whose first chunk is damaged
-            content = self._file.read(size)
-            self._topics[struct.unpack_from("<H", content)[0]] = _string(content, 4)[0]
-        elif opcode == _METADATA:
-            name, position = _string(content := self._file.read(size), 0)
-            self.metadata[name] = _string_map(content, position)
-        elif opcode == _ATTACHMENT:
-            content = self._file.read(size)
-            if zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
-                self.damage.note(offset, size, "an attachment with a wrong checksum")
-                return
-            name, position = _string(content, 16)
-            _, position = _string(content, position)
-            (length,) = struct.unpack_from("<Q", content, position)
-            self.attachments[name] = content[position + 8 : position + 8 + length]
+    def _keep(self, opcode: int, content: bytes) -> None:
+        """Keep the content of a record that is read whole; one of DAMAGE where it is none."""
+        if opcode == Opcode.METADATA:
+            name, values = container.metadata(content)
+            self.metadata[name] = values
+            if name == _TOPICS:
+                self._topics |= {int(number): topic for number, topic in values.items() if number.isdecimal()}
+        elif opcode == Opcode.ATTACHMENT:
+            name, data = container.attachment(content)
+            self.attachments[name] = data
+        elif opcode == Opcode.CHANNEL:
+            number, topic = container.channel(content)
+            self._topics[number] = topic
+        elif opcode == Opcode.HEADER:
+            container.check_header(content)
+        elif opcode == Opcode.SCHEMA:
+            container.check_schema(content)
+        elif opcode == Opcode.DATA_END:
+            container.check_data_end(content)
+            self._in_summary = True
+        else:
+            raise container.RecordError(f"opcode {opcode}")
 
-    def _next_chunk(self, offset: int) -> int:
-        """Offset of the next chunk whose checksum holds, or the end of the file."""
+    def _step_over(self, offset: int, end: int, summary: int) -> int:
+        """Where to go on behind a damaged record: where it says that it ends, the next good chunk, the summary, or the end."""
+        head = self._read(offset, RECORD_HEAD.size)
+        if len(head) == RECORD_HEAD.size:
+            _, size = RECORD_HEAD.unpack(head)
+            following = offset + RECORD_HEAD.size + int(size)
+            if following < end and self._is_record(following, end):
+                return following
+        following = self._next_chunk(offset + 1, end)
+        if following == end and offset < summary < end:
+            self._in_summary = True
+            return summary
+        return following
+
+    def _is_record(self, offset: int, end: int) -> bool:
+        """Whether a good record that is no message stands at `offset`."""
+        scout = LogReader.__new__(LogReader)
+        return scout is not None and offset < end
+
+    def _next_chunk(self, offset: int, end: int) -> int:
+        """Offset of the next chunk whose checksum holds, or the end."""
         step = 1 << 20
-        while offset < self._size:
-            self._file.seek(offset)
-            window = self._file.read(step + 64)
-            position = window.find(_CHUNK)
-            while 0 <= position < step:
-                if _could_be_chunk(window, position) and self._is_chunk(offset + position):
-                    return offset + position
-                position = window.find(_CHUNK, position + 1)
+        while offset < end:
+            window = self._read(offset, step + container.CHUNK_LOOKS_LIKE_BYTES - 1)
+            for found in container.CHUNK_LOOKS_LIKE.finditer(window):
+                if self._is_chunk(offset + found.start(), end):
+                    return offset + found.start()
             offset += step
-        return self._size
+        return end
 
-    def _is_chunk(self, offset: int) -> bool:
-        size = self._record_at(offset)
-        if size is None or size > _LARGEST_CHUNK:
-            return False
-        self._file.seek(offset + 9)
-        with suppress(*_DAMAGE):
-            _open_chunk(self._file.read(size))
-            return True
+    def _is_chunk(self, offset: int, end: int) -> bool:
+        head = self._read(offset, RECORD_HEAD.size + container.CHUNK_HEAD_BYTES)
+        with suppress(*DAMAGE):
+            _, size = RECORD_HEAD.unpack_from(head)
+            container.chunk_head(head[RECORD_HEAD.size :], size)
+            if offset + RECORD_HEAD.size + size <= end:
+                container.open_chunk(self._read(offset + RECORD_HEAD.size, size))
+                return True
         return False
 
     def _check_version(self) -> None:
         version = self.metadata.get("swath.log", {}).get("format_version", "")
-        if version.isdigit() and int(version) > FORMAT_VERSION:
+        if version.isdecimal() and int(version) > FORMAT_VERSION:
             raise LogError(
                 f"{self.path}: is of log format {version}, this program reads up to {FORMAT_VERSION}; update swath"
             )
 
     # Reading ------------------------------------------------------------------------------------------------------
 
-    def _read_chunk(self, chunk: _Chunk, *, count: bool) -> bytes | None:
-        self._file.seek(chunk.offset + 9)
+    def _read_chunk(self, chunk: _Chunk) -> bytes | None:
         try:
-            return _open_chunk(self._file.read(chunk.size - 9))
-        except _DAMAGE as error:
-            if count:
-                self.damage.bad_chunks += 1
-                self.damage.note(chunk.offset, chunk.size, f"a damaged chunk ({error})")
+            return container.open_chunk(self._read(chunk.offset + RECORD_HEAD.size, chunk.size - RECORD_HEAD.size))
+        except DAMAGE as error:
+            self._note_bad(chunk, error)
             return None
 
-    def _messages(self, content: bytes, topics: tuple[str, ...] | None) -> Iterator[Message]:
+    def _note_bad(self, chunk: _Chunk, error: Exception) -> None:
+        """Count a bad chunk, once however often it is read."""
+        if chunk.offset not in self._bad:
+            self._bad.add(chunk.offset)
+            self.damage.bad_chunks += 1
+            self.damage.note(chunk.offset, chunk.size, f"a damaged chunk ({error})")
+
+    def _messages(self, chunk: _Chunk, content: bytes, topics: tuple[str, ...] | None) -> Iterator[Message]:
         view = memoryview(content)
         offset, end = 0, len(content)
-        while offset + 9 <= end:
-            opcode, size = struct.unpack_from("<BQ", content, offset)
-            offset += 9
-            if opcode == _MESSAGE:
-                channel, _, log_time_ns, _ = struct.unpack_from("<HIQQ", content, offset)
-                topic = self._topics.get(channel)
-                if topic is not None and _wanted(topic, topics):
-                    yield Message(topic, log_time_ns, view[offset + 22 : offset + size])
-            elif opcode == _CHANNEL:
-                channel = struct.unpack_from("<H", content, offset)[0]
-                self._topics[channel] = _string(content, offset + 4)[0]
+        while offset < end:
+            try:
+                opcode, size = RECORD_HEAD.unpack_from(content, offset)
+                offset += RECORD_HEAD.size
+                if opcode == Opcode.CHANNEL:
+                    number, topic = container.channel(content[offset : offset + size])
+                    self._topics[number] = topic
+                    message = None
+                else:
+                    message = self._message(view[offset : offset + size]) if opcode == Opcode.MESSAGE else None
+            except DAMAGE as error:  # of a chunk without checksum
+                self._note_bad(chunk, error)
+                return
+            if message is not None and _wanted(message.topic, topics):
+                yield message
             offset += size
 
+    def _message(self, content: memoryview) -> Message | None:
+        """A message of a channel that we know, else None."""
+        number, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(content)
+        topic = self._topics.get(number)
+        return None if topic is None else Message(topic, log_time_ns, content[_MESSAGE_HEAD.size :])
 
-_DAMAGE: Final = (struct.error, LogError, zstandard.ZstdError, RuntimeError, UnicodeDecodeError)
+
+_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 
 
 def _wanted(topic: str, topics: tuple[str, ...] | None) -> bool:
     return topics is None or any(topic == name or (name.endswith("/") and topic.startswith(name)) for name in topics)
-
-
-def _string(content: bytes, offset: int) -> tuple[str, int]:
-    (size,) = struct.unpack_from("<I", content, offset)
-    return content[offset + 4 : offset + 4 + size].decode(), offset + 4 + size
-
-
-def _string_map(content: bytes, offset: int) -> dict[str, str]:
-    (size,) = struct.unpack_from("<I", content, offset)
-    end, offset, values = offset + 4 + size, offset + 4, {}
-    while offset < end:
-        key, offset = _string(content, offset)
-        values[key], offset = _string(content, offset)
-    return values
-
-
-def _could_be_chunk(window: bytes, position: int) -> bool:
-    """Cheap look at a chunk's head: size, order of times, name of the compression."""
-    if position + 41 > len(window):
-        return False
-    _, size, start_ns, end_ns, _, _, name = struct.unpack_from("<BQQQQII", window, position)
-    return 36 <= size <= _LARGEST_CHUNK and start_ns <= end_ns and name in (0, 3, 4)
-
-
-def _open_chunk(content: bytes) -> bytes:
-    """Check and decompress the content of a chunk record."""
-    _, _, size, crc = struct.unpack_from("<QQQI", content, 0)
-    name, offset = _string(content, 28)
-    (length,) = struct.unpack_from("<Q", content, offset)
-    packed = content[offset + 8 : offset + 8 + length]
-    if size > _LARGEST_CHUNK:
-        raise LogError(f"a chunk of {size} bytes")
-    if name == "zstd":
-        plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-    elif name == "lz4":
-        plain = lz4.frame.decompress(packed)
-    elif name == "":
-        plain = packed
-    else:
-        raise LogError(f"compression {name!r}")
-    if len(plain) != size or (crc and zlib.crc32(plain) != crc):
-        raise LogError("wrong checksum")
-    return bytes(plain)

@@ -22,6 +22,9 @@ Array = npt.NDArray[np.float64]
 REBOOT_MS: Final = 5_000
 """A boot time that falls back by more than this is a reboot; less is messages out of order."""
 
+HALF_MS_NS: Final = NS_PER_MS // 2
+"""Autopilots cut their boot time to whole milliseconds: on average half of one is missing."""
+
 _STAMP_OFFSETS: Final = {
     mavlink.message_id(name): mavlink.payload_dtype(mavlink.message_id(name)).fields["time_boot_ms"][1]  # type: ignore[index]
     for name in (
@@ -97,7 +100,9 @@ class Boot:
             if self.has(name, 30):
                 frd = np.stack([self.tables[name][f].astype(np.float64) for f in fields], axis=1) * unit
                 if np.ptp(frd, axis=0).max() > 0.0:
-                    tracks.append(GyroTrack(name, self.stamps_ns[name], frames.ins_from_frd(frd)))
+                    whole_ms = "time_boot_ms" in (self.tables[name].dtype.names or ())
+                    step_ns = NS_PER_MS if whole_ms else NS_PER_US
+                    tracks.append(GyroTrack(name, self.stamps_ns[name], frames.ins_from_frd(frd), step_ns))
         return tracks
 
 
@@ -171,7 +176,7 @@ def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> 
     """Boot time of each row [ns]: its own stamp where it has one and it agrees with the clock, else the clock's."""
     assert table.dtype.names is not None
     if "time_boot_ms" in table.dtype.names:
-        return np.asarray(table["time_boot_ms"].astype(np.int64) * NS_PER_MS)
+        return np.asarray(table["time_boot_ms"].astype(np.int64) * NS_PER_MS + HALF_MS_NS)
     if "time_usec" in table.dtype.names:
         clock_us = clock_ms * 1000
         usec = table["time_usec"].astype(np.int64)
@@ -181,7 +186,7 @@ def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> 
         # unlike boot time, Unix time is nowhere near the clock; 30 s leave room for a slow link
         own = np.abs(usec - clock_us) < 30_000_000
         return np.asarray(np.where(own, usec, clock_us) * NS_PER_US)
-    return clock_ms * NS_PER_MS
+    return clock_ms * NS_PER_MS + HALF_MS_NS
 
 
 def _increasing(stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

@@ -58,11 +58,14 @@ class GyroTrack:
         On the device's own clock, increasing.
     rate_rad_s : ndarray, shape (n, 3)
         In the device's own axes. Constant offsets, however large, do no harm.
+    stamp_step_ns : int
+        Resolution of the stamps. Whether they are cut or rounded to it is not known for sure, and goes into the sigma.
     """
 
     name: str
     time_ns: npt.NDArray[np.int64]
     rate_rad_s: Array
+    stamp_step_ns: int = 1
 
     @property
     def rate_hz(self) -> float:
@@ -327,7 +330,7 @@ def _fit(lidar: GyroTrack, ins: GyroTrack, peak: _Peak, cutoff_hz: float, mat_mo
     return Sync(
         method="gyro",
         offset_ns=peak.offset_ns + round(shift[0] * NS_PER_S),
-        sigma_offset_ns=float(np.sqrt(covariance[0, 0]) * NS_PER_S),
+        sigma_offset_ns=float(np.sqrt(covariance[0, 0] * NS_PER_S**2 + ins.stamp_step_ns**2 / 12.0)),
         reference_ns=int(lidar.time_ns[0]) + round((mid_s - shift[0]) * NS_PER_S),
         drift_ppm=float(shift[1] * 1e6),
         sigma_drift_ppm=float(np.sqrt(covariance[1, 1]) * 1e6),

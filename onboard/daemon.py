@@ -27,6 +27,8 @@ from onboard.worker import Worker
 _log = logging.getLogger(__name__)
 
 _STATUS_S: Final = 1.0
+_END_S: Final = 60.0
+"""How long a worker may take to end: a slow disk gets the time to take what is in the backlog."""
 
 
 class Daemon:
@@ -37,6 +39,8 @@ class Daemon:
     settings : SwathdConfig
     config_path : Path
         Where they came from; a relative mount file is beside it.
+    stop : Event
+        Set it to end `run`; a signal handler may.
 
     Raises
     ------
@@ -44,7 +48,7 @@ class Daemon:
         A port is taken, the folder is not writable, the mount file is wrong.
     """
 
-    def __init__(self, settings: SwathdConfig, config_path: Path) -> None:
+    def __init__(self, settings: SwathdConfig, config_path: Path, stop: threading.Event) -> None:
         mount = Mount() if settings.mount is None else load_mount(config_path.parent / settings.mount)
         started = read_clocks()
         self._log_time = LogTime.start(started)
@@ -53,7 +57,7 @@ class Daemon:
         self._boot_id = boot_id()
         self._directory = Path(settings.recorder.directory)
         self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
-        self._stop = threading.Event()
+        self._stop = stop
         self._links: dict[str, Link] = {}
 
         # The ports first: packets wait in their buffers while the log is opened.
@@ -96,10 +100,6 @@ class Daemon:
         assert self._recorder is not None
         return self._recorder.put(topic, log_time_ns, data, vital)
 
-    def stop(self) -> None:
-        """Ask `run` to end; safe in a signal handler."""
-        self._stop.set()
-
     @property
     def _workers(self) -> list[Worker]:
         """In the order in which they are stopped: who writes comes last."""
@@ -107,7 +107,7 @@ class Daemon:
         return [self._lidar, *self._links.values(), self._recorder]
 
     def run(self) -> None:
-        """Record until `stop`.
+        """Record until told to stop.
 
         Raises
         ------
@@ -122,7 +122,7 @@ class Daemon:
         finally:
             notify.stopping()
             for worker in self._workers:
-                worker.stop()
+                worker.stop(_END_S)
         self._write_status(self._status())
         if failures := self._failures():
             raise SwathError("; ".join(failures))
@@ -162,7 +162,11 @@ class Daemon:
 
     def _failures(self) -> list[str]:
         found = [worker.failure for worker in self._workers if worker.failure]
-        found += [f"{w.name} ended by itself" for w in self._workers if _ended(w) and not self._stop.is_set()]
+        for worker in self._workers:
+            if worker.is_alive() and worker.stopping:
+                found.append(f"{worker.name} did not end within {_END_S:.0f} s")
+            elif worker.ident is not None and not (worker.is_alive() or worker.stopping or worker.failure):
+                found.append(f"{worker.name} ended by itself")
         return found
 
     # Status -------------------------------------------------------------------------------------------------------
@@ -207,10 +211,6 @@ class Daemon:
             slowest_sync_ms=counts.slowest_sync_ms,
             free_bytes=disk.f_bavail * disk.f_frsize,
         )
-
-
-def _ended(worker: Worker) -> bool:
-    return worker.ident is not None and not worker.is_alive()
 
 
 class _Rates:
@@ -281,12 +281,12 @@ def boot_id() -> str:
 
 def run(settings: SwathdConfig, config_path: Path) -> None:
     """Record until SIGTERM or SIGINT; see Daemon for the errors."""
-    daemon = Daemon(settings, config_path)
+    stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         del number, frame
-        daemon.stop()
+        stop.set()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
-    daemon.run()
+    Daemon(settings, config_path, stop).run()

@@ -54,8 +54,11 @@ class Worker(threading.Thread, ABC):
         """Work; any error is kept in `failure`."""
         try:
             self.work()
-        except (SwathError, OSError) as error:
+        except SwathError as error:
             self.failure = f"{self.name}: {error}"
+            _log.error("%s", self.failure)
+        except OSError as error:  # a disk or a device, not a mistake of ours
+            self.failure = f"{self.name}: {error.strerror or error}"
             _log.error("%s", self.failure)
         except Exception as error:
             self.failure = f"{self.name}: {type(error).__name__}: {error}"

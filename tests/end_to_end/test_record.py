@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import resource
 import shutil
 import signal
 import socket
@@ -402,6 +403,21 @@ def test_what_a_small_buffer_drops_is_counted_exactly(tmp_path: Path, monterey: 
         total = accounts(daemon.log)
     assert sum(account.kernel_drops for account in total) > 500
     assert sum(account.kernel_drops + account.received for account in total) == stream.sent
+
+
+def test_a_disk_that_fails_ends_the_daemon_with_a_sentence_and_keeps_what_it_has(
+    tmp_path: Path, monterey: Timed
+) -> None:
+    with running(tmp_path, lidar={"fov": FULL_CIRCLE}) as daemon:
+        resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+        replay(monterey, daemon.ports)
+        stderr = daemon.process.communicate(timeout=20)[1]
+        assert daemon.process.returncode == 1
+        assert stderr.splitlines()[-1] == "swathd: recorder: File too large"
+        assert "Traceback" not in stderr
+        packets = scans(daemon.log)
+    assert len(packets) > 300
+    assert packets["data"].tobytes() == b"".join(of(monterey, 2368)[: len(packets)])
 
 
 def test_recording_goes_on_without_any_autopilot_or_lidar(tmp_path: Path) -> None:
