@@ -18,7 +18,7 @@ from flightlog.mount import Mount
 from groundproc import decode
 from groundproc.decode import Gate, LaserTable
 from groundproc.geodesy import Polynomial
-from groundproc.trajectory.trajectory import Trajectory
+from groundproc.trajectory.trajectory import HOLD, Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -106,18 +106,7 @@ def georeference(
     data = packets["data"] if packets.dtype.names and "data" in packets.dtype.names else packets
     raw, dual = decode.raw_bytes(packets), decode.is_dual(data)
     lasers = lasers or LaserTable.nominal()
-    stride = 2 if dual else 1
-    firings = BLOCKS // stride
-    firing_ns = (time_ns[:, None] + np.arange(firings, dtype=np.int64) * FIRING_NS + MID_FIRING_NS).ravel()
-    poses, covered = trajectory.where_covered(firing_ns)
-    sensor = np.empty((len(firing_ns), 12))
-    _sensor_poses(
-        poses.position_m,
-        poses.quat_local_ins_wxyz,
-        mount.mat_ins_lidar(),
-        mount.lidar_position_m(),
-        sensor,
-    )
+    sensor, covered = sensor_poses(time_ns, BLOCKS // 2 if dual else BLOCKS, trajectory, mount)
     size = len(raw) * BLOCKS * LASERS
     out = (
         np.empty(size, np.int64),
@@ -149,9 +138,45 @@ def project(xyz_m: Array, polynomial: Polynomial) -> None:
     _project(xyz_m, polynomial.centre_m, polynomial.coefficients)
 
 
+def sensor_poses(
+    time_ns: npt.NDArray[np.int64], firings: int, trajectory: Trajectory, mount: Mount
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Pose of the sensor at the middle of each firing.
+
+    The trajectory is asked at the first and the last firing of each packet, and what lies between, half a millisecond, is filled
+    linearly: at 1000 deg/s^2 and 10 m/s^2 that is right to 1e-6 rad and 1e-6 m. A held pose grid is asked for every firing.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+        Stamps of the packets [ns] on the trajectory's scale.
+    firings : int
+        In a packet.
+    trajectory, mount
+
+    Returns
+    -------
+    poses : ndarray, shape (n * firings, 12)
+        Rows of the matrix "local from sensor", then the position [m].
+    covered : ndarray of bool, shape (n * firings,)
+    """
+    asked = np.arange(firings) if trajectory.interpolation == HOLD else np.array([0, firings - 1])
+    times = (time_ns[:, None] + asked * FIRING_NS + MID_FIRING_NS).ravel()
+    poses, known = trajectory.where_covered(times)
+    at_asked = np.empty((len(times), 12))
+    _sensor_poses(
+        poses.position_m, poses.quat_local_ins_wxyz, mount.mat_ins_lidar(), mount.lidar_position_m(), at_asked
+    )
+    if len(asked) == firings:
+        return at_asked, known
+    out, covered = np.empty((len(time_ns) * firings, 12)), np.empty(len(time_ns) * firings, np.bool_)
+    _fill(at_asked, known, firings, out, covered)
+    return out, covered
+
+
 @njit(cache=True, nogil=True)
 def _sensor_poses(position: Any, quat: Any, mat_ins_lidar: Any, lever: Any, out: Any) -> None:
-    """Rows of a matrix "local from sensor" and the sensor's position for each firing; `out` has shape (n, 12)."""
+    """Rows of a matrix "local from sensor" and the sensor's position for each pose; `out` has shape (n, 12)."""
     for i in range(len(out)):
         w, x, y, z = quat[i]
         m = (
@@ -167,6 +192,21 @@ def _sensor_poses(position: Any, quat: Any, mat_ins_lidar: Any, lever: Any, out:
                     a * mat_ins_lidar[0, column] + b * mat_ins_lidar[1, column] + c * mat_ins_lidar[2, column]
                 )
             pose[9 + row] = position[i, row] + a * lever[0] + b * lever[1] + c * lever[2]
+
+
+@njit(cache=True, nogil=True)
+def _fill(ends: Any, known: Any, firings: int, out: Any, covered: Any) -> None:
+    """Poses between the first and the last firing of each packet."""
+    for packet in range(len(ends) // 2):
+        both = known[2 * packet] and known[2 * packet + 1]
+        for firing in range(firings):
+            covered[packet * firings + firing] = both
+            if both:
+                part = firing / (firings - 1)
+                for i in range(12):
+                    out[packet * firings + firing, i] = (1 - part) * ends[2 * packet, i] + part * ends[
+                        2 * packet + 1, i
+                    ]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
