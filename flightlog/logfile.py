@@ -6,7 +6,6 @@ damaged byte, and a log from a crash is the one that matters most.
 
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +17,7 @@ from flightlog import container
 from flightlog.container import DAMAGE, MAGIC, RECORD_HEAD, Opcode
 from flightlog.errors import LogError
 from flightlog.records import FORMAT_VERSION, record_type
+from flightlog.walk import ChunkAt, Hole, Walk
 
 _TOPICS: Final = "swath.topics"
 
@@ -146,13 +146,6 @@ class Damage:
         return self.truncated or self.bad_chunks > 0 or self.lost_bytes > 0
 
 
-class _Chunk(NamedTuple):
-    offset: int
-    size: int
-    start_ns: int
-    end_ns: int
-
-
 class LogReader:
     """Reads a flight log, whole or cut off, in bounded memory.
 
@@ -180,10 +173,9 @@ class LogReader:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.damage = Damage()
-        self._chunks: list[_Chunk] = []
+        self._chunks: list[ChunkAt] = []
         self._topics: dict[int, str] = {}
         self._bad: set[int] = set()
-        self._in_summary = False
         try:
             self._file = self.path.open("rb")
         except OSError as error:
@@ -245,119 +237,33 @@ class LogReader:
         if progress is not None:
             progress(self._size - done)
 
-    # Skimming -----------------------------------------------------------------------------------------------------
+    # Opening ------------------------------------------------------------------------------------------------------
 
     def _skim(self) -> None:
         self._size = self.path.stat().st_size
         if self._read(0, len(MAGIC)) != MAGIC:
             raise LogError(f"{self.path}: is no MCAP file (its first bytes are not {MAGIC!r})")
-        tail = self._read(max(0, self._size - container.FOOTER_BYTES), container.FOOTER_BYTES)
-        summary = container.footer(tail)
-        self.damage.truncated = summary is None
-        end = self._size if summary is None else self._size - container.FOOTER_BYTES
-        offset = len(MAGIC)
-        while offset < end:
-            following = self._take(offset, end)
-            if following is None:
-                following = self._step_over(offset, end, summary or end)
-                self.damage.note(offset, following - offset, "no valid record")
-            offset = following
-        if self._loose and not self._chunks and not self.metadata:
+        walk, loose = Walk(self._file, self._size), False
+        for found in walk:
+            if isinstance(found, Hole):
+                self.damage.note(found.offset, found.size, "no valid record")
+                loose |= found.looks_loose
+            elif isinstance(found, ChunkAt):
+                self._chunks.append(found)
+            elif isinstance(found, container.Channel):
+                self._topics[found.number] = found.topic
+            elif isinstance(found, container.Attachment):
+                self.attachments[found.name] = found.data
+            else:
+                self.metadata[found.name] = found.values
+        self.damage.truncated = not walk.finished
+        if loose and not self._chunks and not self.metadata:
             raise LogError(f"{self.path}: holds messages outside of chunks, which no flight log does")
+        self._topics |= {int(n): topic for n, topic in self.metadata.get(_TOPICS, {}).items() if n.isdecimal()}
 
     def _read(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
         return self._file.read(size)
-
-    def _take(self, offset: int, end: int) -> int | None:
-        """Keep what an opened log must know of the record at `offset`; give the place behind it, None for no valid record."""
-        head = self._read(offset, RECORD_HEAD.size + container.CHUNK_HEAD_BYTES)
-        if len(head) < RECORD_HEAD.size:
-            return None
-        opcode, size = RECORD_HEAD.unpack_from(head)
-        following = offset + RECORD_HEAD.size + int(size)
-        if following > end:
-            return None
-        head = head[RECORD_HEAD.size :]
-        try:
-            if opcode == Opcode.CHUNK:
-                start_ns, end_ns, *_ = container.chunk_head(head, size)
-                self._chunks.append(_Chunk(offset, following - offset, start_ns, end_ns))
-            elif opcode == Opcode.MESSAGE_INDEX:
-                return following if container.is_message_index(head, size) else None
-            elif opcode == Opcode.MESSAGE:
-                self._loose = True  # a damaged opcode in our logs; others may write whole files so
-                return None
-            elif opcode in container.SUMMARY_ONLY:
-                return following if self._in_summary else None
-            else:
-                self._keep(opcode, self._read(offset + RECORD_HEAD.size, size))
-        except DAMAGE:
-            return None
-        return following
-
-    def _keep(self, opcode: int, content: bytes) -> None:
-        """Keep the content of a record that is read whole; one of DAMAGE where it is none."""
-        if opcode == Opcode.METADATA:
-            name, values = container.metadata(content)
-            self.metadata[name] = values
-            if name == _TOPICS:
-                self._topics |= {int(number): topic for number, topic in values.items() if number.isdecimal()}
-        elif opcode == Opcode.ATTACHMENT:
-            name, data = container.attachment(content)
-            self.attachments[name] = data
-        elif opcode == Opcode.CHANNEL:
-            number, topic = container.channel(content)
-            self._topics[number] = topic
-        elif opcode == Opcode.HEADER:
-            container.check_header(content)
-        elif opcode == Opcode.SCHEMA:
-            container.check_schema(content)
-        elif opcode == Opcode.DATA_END:
-            container.check_data_end(content)
-            self._in_summary = True
-        else:
-            raise container.RecordError(f"opcode {opcode}")
-
-    def _step_over(self, offset: int, end: int, summary: int) -> int:
-        """Where to go on behind a damaged record: where it says that it ends, the next good chunk, the summary, or the end."""
-        head = self._read(offset, RECORD_HEAD.size)
-        if len(head) == RECORD_HEAD.size:
-            _, size = RECORD_HEAD.unpack(head)
-            following = offset + RECORD_HEAD.size + int(size)
-            if following < end and self._is_record(following, end):
-                return following
-        following = self._next_chunk(offset + 1, end)
-        if following == end and offset < summary < end:
-            self._in_summary = True
-            return summary
-        return following
-
-    def _is_record(self, offset: int, end: int) -> bool:
-        """Whether a good record that is no message stands at `offset`."""
-        scout = LogReader.__new__(LogReader)
-        return scout is not None and offset < end
-
-    def _next_chunk(self, offset: int, end: int) -> int:
-        """Offset of the next chunk whose checksum holds, or the end."""
-        step = 1 << 20
-        while offset < end:
-            window = self._read(offset, step + container.CHUNK_LOOKS_LIKE_BYTES - 1)
-            for found in container.CHUNK_LOOKS_LIKE.finditer(window):
-                if self._is_chunk(offset + found.start(), end):
-                    return offset + found.start()
-            offset += step
-        return end
-
-    def _is_chunk(self, offset: int, end: int) -> bool:
-        head = self._read(offset, RECORD_HEAD.size + container.CHUNK_HEAD_BYTES)
-        with suppress(*DAMAGE):
-            _, size = RECORD_HEAD.unpack_from(head)
-            container.chunk_head(head[RECORD_HEAD.size :], size)
-            if offset + RECORD_HEAD.size + size <= end:
-                container.open_chunk(self._read(offset + RECORD_HEAD.size, size))
-                return True
-        return False
 
     def _check_version(self) -> None:
         version = self.metadata.get("swath.log", {}).get("format_version", "")
@@ -368,21 +274,21 @@ class LogReader:
 
     # Reading ------------------------------------------------------------------------------------------------------
 
-    def _read_chunk(self, chunk: _Chunk) -> bytes | None:
+    def _read_chunk(self, chunk: ChunkAt) -> bytes | None:
         try:
             return container.open_chunk(self._read(chunk.offset + RECORD_HEAD.size, chunk.size - RECORD_HEAD.size))
         except DAMAGE as error:
             self._note_bad(chunk, error)
             return None
 
-    def _note_bad(self, chunk: _Chunk, error: Exception) -> None:
+    def _note_bad(self, chunk: ChunkAt, error: Exception) -> None:
         """Count a bad chunk, once however often it is read."""
         if chunk.offset not in self._bad:
             self._bad.add(chunk.offset)
             self.damage.bad_chunks += 1
             self.damage.note(chunk.offset, chunk.size, f"a damaged chunk ({error})")
 
-    def _messages(self, chunk: _Chunk, content: bytes, topics: tuple[str, ...] | None) -> Iterator[Message]:
+    def _messages(self, chunk: ChunkAt, content: bytes, topics: tuple[str, ...] | None) -> Iterator[Message]:
         view = memoryview(content)
         offset, end = 0, len(content)
         while offset < end:
