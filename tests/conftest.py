@@ -1,0 +1,138 @@
+"""Simulated flights that tests of several packages process: made once for a test run, whatever the number of its workers."""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Files of a simulated flight."""
+
+    folder: Path
+
+    @property
+    def log(self) -> Path:
+        return self.folder / "flight.mcap"
+
+    @property
+    def capture(self) -> Path:
+        return self.folder / "capture.pcap"
+
+    @property
+    def telemetry(self) -> Path:
+        return self.folder / "telemetry.tlog"
+
+    @property
+    def poses_file(self) -> Path:
+        return self.folder / "truth.csv"
+
+    @cached_property
+    def truth(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads((self.folder / "truth.json").read_text())
+        return content
+
+    @cached_property
+    def poses(self) -> npt.NDArray[np.void]:
+        return np.asarray(np.genfromtxt(self.poses_file, delimiter=",", names=True, dtype=None))
+
+    def offset_s(self, lidar_s: float) -> float:
+        """True boot time minus lidar time when the lidar's clock, as it sends it, shows `lidar_s`."""
+        lidar, boot = self.truth["clocks"]["lidar"], self.truth["clocks"]["boot"]
+        elapsed_s = (lidar_s - lidar["start_ns"] * 1e-9) / (1 + lidar["drift_ppm"] * 1e-6)
+        return float(boot["start_ns"] * 1e-9 + elapsed_s * (1 + boot["drift_ppm"] * 1e-6) - lidar_s)
+
+
+def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int) -> None:
+    """All files of a simulation, with the lidar's data packets of one 0.1 s in `every` only: rays are what costs."""
+    from simulator.render import CAPTURE, LOG, POSES, TLOG, TRUTH, Job, Recording, Simulation
+    from simulator.truth import write_json
+
+    simulation = Simulation(Job(scene, seconds, seed, folder, options))
+    with Recording(simulation, {name: folder / name for name in (LOG, CAPTURE, TLOG, POSES)}) as recording:
+        for chunk in range(simulation.chunks):
+            recording.add(chunk, simulation.sweep(chunk) if chunk % every == 0 else simulation.lidar.sweep(0, 0))
+    write_json(folder / TRUTH, simulation.truth())
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulated]:
+    """A function that simulates: simulated(name, scene, seconds, options, seed=..., every=...); the name is its folder."""
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "simulated"
+    shared.mkdir(exist_ok=True)
+
+    def get(name: str, scene: str, seconds: float, options: Any, *, seed: int = 5, every: int = 1) -> Simulated:
+        folder, done = shared / name, shared / f"{name}.done"
+        try:
+            folder.mkdir()
+        except FileExistsError:  # made already, or another worker is at it
+            deadline = time.monotonic() + 300.0
+            while not done.exists():
+                assert time.monotonic() < deadline, f"{name}: the worker that simulates it has not finished in 300 s"
+                time.sleep(0.1)
+            return Simulated(folder)
+        _render(folder, scene, seconds, seed, options, every)
+        done.touch()
+        return Simulated(folder)
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def gps_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """16 s over level ground and along a wall, with all errors; the lidar's clock is steered by its own GPS."""
+    from simulator.config import Options
+
+    options = Options()
+    options = replace(options, clocks=replace(options.clocks, lidar_gps=True))
+    return simulated("gps_flight", "field", 16.0, options, every=4)
+
+
+@pytest.fixture(scope="session")
+def plain_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """25 s round the village, with all errors and no GPS on the lidar: its clock counts from power-on."""
+    from simulator.config import Options
+
+    return simulated("plain_flight", "village", 25.0, Options(), every=10)
+
+
+@pytest.fixture(scope="session")
+def dual_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """2 s in the village in dual return mode: too short to synchronise by gyros."""
+    from simulator.config import Options
+
+    options = Options()
+    options = replace(options, lidar=replace(options.lidar, returns="dual"))
+    return simulated("dual_flight", "village", 2.0, options, every=2)
+
+
+@pytest.fixture(scope="session")
+def still_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """12 s on a tripod: nothing to correlate."""
+    from simulator.config import Options
+
+    return simulated("still_flight", "panels", 12.0, Options(), every=20)
+
+
+@pytest.fixture(scope="session")
+def rebooted_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """45 s with a reboot of the autopilot from 20 to 24 s, over MAVLink 2."""
+    from simulator.config import Options
+
+    options = Options()
+    options = replace(
+        options,
+        faults=replace(options.faults, reboot_at_s=20.0, reboot_silence_s=4.0),
+        link=replace(options.link, version=2),
+    )
+    return simulated("rebooted_flight", "village", 45.0, options, every=20)
