@@ -291,4 +291,4 @@ def mavlink_frames(
         for message in reader.messages((records.MAVLINK.topic + link,), progress):
             for time_ns, data in records.decode_raw(message.data):
                 yield from parser.feed(time_ns, data)
-    parser.finish()
+    yield from parser.finish()

@@ -129,7 +129,8 @@ def _frame_end(data: Bytes, offset: int) -> int | None:
 
 def _is_good(frame: bytes) -> bool:
     """Whether these bytes are exactly one frame with a right checksum."""
-    found = FrameParser().feed(0, frame)
+    parser = FrameParser()
+    found = parser.feed(0, frame) + parser.finish()
     return len(found) == 1 and found[0].known and len(found[0].data) == len(frame)
 
 
@@ -186,8 +187,7 @@ def _judge(body: bytes, count: TlogCount, *, last: bool) -> None:
     """Count the frames and the bad bytes of one record."""
     count.records += 1
     parser = FrameParser()
-    found = parser.feed(0, body)
-    parser.finish()
+    found = parser.feed(0, body) + parser.finish()
     known = sum(frame.known for frame in found)
     count.frames += known
     count.unknown += len(found) - known

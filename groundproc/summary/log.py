@@ -108,8 +108,9 @@ class LogSummary:
         """Take what is still held back; no more messages will come."""
         for batch in self._batches.finish():
             self.lidar.add(batch)
-        for parser, _ in self.links.values():
-            parser.finish()
+        for parser, telemetry in self.links.values():
+            for frame in parser.finish():
+                telemetry.add(frame)
 
     def result(self) -> dict[str, Any]:
         """The figures of the messages; see `swath info --json`."""
