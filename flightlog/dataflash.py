@@ -35,7 +35,8 @@ class Dataflash:
     tables : dict of str to structured ndarray, shape (n,)
         Fields as declared by the log, scaled: latitudes in degrees, hundredths resolved.
     bad_bytes : int
-        Bytes that belong to no message.
+        Bytes that belong to no message, or to one that cannot be read: of a type with a field letter that nobody knows, or of a
+        name that was declared anew with other fields (the last declaration stands).
     """
 
     tables: dict[str, npt.NDArray[np.void]] = field(default_factory=dict)
@@ -46,7 +47,8 @@ class Dataflash:
 class _Format:
     name: str
     size: int
-    dtype: np.dtype[np.void]
+    dtype: np.dtype[np.void] | None
+    """None: its length is known, its fields are not."""
     scales: tuple[float | None, ...]
 
 
@@ -66,7 +68,7 @@ def parse(data: bytes, place: str) -> Dataflash:
     if not is_dataflash(data):
         raise CaptureError(f"{place}: is no ArduPilot dataflash log (it does not start with A3 95 80)")
     formats = {_FMT: _Format("FMT", _FMT_BYTES, np.dtype("V86"), ())}
-    bodies: dict[int, list[bytes]] = {}
+    bodies: dict[_Format, list[bytes]] = {}
     log = Dataflash()
     offset, end = 0, len(data)
     while offset + 3 <= end:
@@ -81,39 +83,52 @@ def parse(data: bytes, place: str) -> Dataflash:
         if data[offset + 2] == _FMT:
             _declare(body, formats)
         else:
-            bodies.setdefault(data[offset + 2], []).append(body)
+            bodies.setdefault(kind, []).append(body)
         offset += kind.size
     log.bad_bytes += end - offset
-    for number, parts in bodies.items():
-        log.tables[formats[number].name] = _table(formats[number], parts)
+    last = {kind.name: kind for kind in bodies if kind.dtype is not None}
+    for kind, parts in bodies.items():
+        if kind.dtype is None or last[kind.name] != kind:
+            log.bad_bytes += kind.size * len(parts)
+        else:
+            log.tables[kind.name] = _table(kind.dtype, kind.scales, parts)
     return log
 
 
 def _declare(body: bytes, formats: dict[int, _Format]) -> None:
-    """Take a FMT message; one that contradicts itself is passed over, and so are its messages."""
+    """Take a FMT message. Of one that contradicts itself, or has letters that we do not know, only the length is taken."""
     number, size = body[0], body[1]
     name, letters, labels = (_text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
-    names = labels.split(",") if labels else []
-    if number == _FMT or not name or len(names) != len(letters) or any(c not in _LETTERS for c in letters):
+    if number == _FMT or size < len(HEAD) + 1:
         return
-    if len(set(names)) != len(names):
-        return
-    dtype = np.dtype([(n, _LETTERS[c][0]) for n, c in zip(names, letters, strict=True)])
-    if dtype.itemsize + 3 == size:
+    dtype = _dtype(letters, labels.split(",") if labels else [])
+    if name and dtype is not None and dtype.itemsize + 3 == size:
         formats[number] = _Format(name, size, dtype, tuple(_LETTERS[c][1] for c in letters))
+    else:
+        formats.setdefault(number, _Format(name, size, None, ()))
 
 
-def _table(kind: _Format, parts: list[bytes]) -> npt.NDArray[np.void]:
-    stored = np.frombuffer(b"".join(part for part in parts if len(part) == kind.dtype.itemsize), kind.dtype)
-    if not any(kind.scales):
+def _dtype(letters: str, names: list[str]) -> np.dtype[np.void] | None:
+    """Storage of the fields as declared, None where that cannot be."""
+    if (
+        len(names) != len(letters)
+        or not all(names)
+        or len(set(names)) != len(names)
+        or not set(letters) <= set(_LETTERS)
+    ):
+        return None
+    return np.dtype([(n, _LETTERS[c][0]) for n, c in zip(names, letters, strict=True)])
+
+
+def _table(dtype: np.dtype[np.void], scales: tuple[float | None, ...], parts: list[bytes]) -> npt.NDArray[np.void]:
+    stored = np.frombuffer(b"".join(parts), dtype)
+    if not any(scales):
         return stored
-    assert kind.dtype.names is not None
-    fields = [
-        (n, "<f8" if scale else kind.dtype.fields[n][0])  # type: ignore[index]
-        for n, scale in zip(kind.dtype.names, kind.scales, strict=True)
-    ]
+    assert dtype.names is not None
+    assert dtype.fields is not None
+    fields = [(n, "<f8" if scale else dtype.fields[n][0]) for n, scale in zip(dtype.names, scales, strict=True)]
     out = np.empty(len(stored), np.dtype(fields))
-    for n, scale in zip(kind.dtype.names, kind.scales, strict=True):
+    for n, scale in zip(dtype.names, scales, strict=True):
         out[n] = stored[n] * scale if scale else stored[n]
     return out
 
