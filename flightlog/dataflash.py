@@ -110,12 +110,9 @@ def _declare(body: bytes, formats: dict[int, _Format]) -> None:
 
 def _dtype(letters: str, names: list[str]) -> np.dtype[np.void] | None:
     """Storage of the fields as declared, None where that cannot be."""
-    if (
-        len(names) != len(letters)
-        or not all(names)
-        or len(set(names)) != len(names)
-        or not set(letters) <= set(_LETTERS)
-    ):
+    if not names or not all(names) or len(set(names)) != len(names):
+        return None
+    if len(names) != len(letters) or not set(letters) <= set(_LETTERS):
         return None
     return np.dtype([(n, _LETTERS[c][0]) for n, c in zip(names, letters, strict=True)])
 
