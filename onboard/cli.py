@@ -76,9 +76,12 @@ def _health(options: argparse.Namespace) -> int:
     path = config.load(options.config).status_path(os.environ.get("RUNTIME_DIRECTORY"))
     try:
         text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise SwathError(f"{path}: the status cannot be read ({error.strerror}); swathd has not run") from None
-    status = health.from_json(text, str(path))
+        status = health.from_json(text, str(path))
+    except (OSError, UnicodeDecodeError, SwathError) as error:
+        # not knowing is as bad as it gets, and a monitor reads the exit code
+        reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
+        print(f"{health.Level.CRITICAL.name}: {reason}")
+        return int(health.Level.CRITICAL)
     boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     verdict = health.judge(status, time.monotonic_ns(), boot_id)
     if options.json:

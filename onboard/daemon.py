@@ -58,6 +58,7 @@ class Daemon:
         self._directory = Path(settings.recorder.directory)
         self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
         self._stop = stop
+        self._status_trouble = False
         self._links: dict[str, Link] = {}
 
         # The ports first: packets wait in their buffers while the log is opened.
@@ -175,7 +176,11 @@ class Daemon:
         try:
             write_atomically(self._status_path, health.to_json(status), sync=False)
         except OSError as error:
-            _log.error("status file %s cannot be written (%s)", self._status_path, error.strerror)
+            if not self._status_trouble:
+                _log.error("status file %s cannot be written (%s)", self._status_path, error.strerror)
+            self._status_trouble = True
+        else:
+            self._status_trouble = False
 
     def _status(self) -> Status:
         now = read_clocks()

@@ -511,3 +511,15 @@ def test_the_sample_configuration_is_one_the_daemon_takes(tmp_path: Path) -> Non
     health = [sys.executable, "-m", "onboard.cli", "health", "--config", str(tmp_path / "sample.yaml")]
     run = subprocess.run(health, capture_output=True, text=True, check=False, timeout=30)
     assert "unknown key" not in run.stderr
+
+
+@pytest.mark.parametrize("content", [None, "{", "\x00"])
+def test_health_without_a_status_is_critical(tmp_path: Path, content: str | None) -> None:
+    (tmp_path / "c.yaml").write_text(f"status_file: {tmp_path}/s.json\n")
+    if content is not None:
+        (tmp_path / "s.json").write_text(content)
+    health = [sys.executable, "-m", "onboard.cli", "health", "--config", str(tmp_path / "c.yaml")]
+    run = subprocess.run(health, capture_output=True, text=True, check=False, timeout=30)
+    assert (run.returncode, run.stderr) == (2, "")
+    assert run.stdout.startswith(f"CRITICAL: {tmp_path}/s.json: ")
+    assert len(run.stdout.splitlines()) == 1
