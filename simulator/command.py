@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="take every error out of the lidar, of the INS, or (no word) of both",
     )  # fmt: skip
     parser.add_argument("--returns", choices=("strongest", "last", "dual"), help="return mode of the lidar")
+    parser.add_argument("--dark", action="store_true", help="cast no rays: quick, for tests of clocks and rates")
     parser.add_argument("--truth-points", action="store_true", help="write every true echo too (59 bytes each)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="threads that cast rays (2)")
     live = parser.add_argument_group("live", "render first, then play in real time to UDP and a pseudo terminal")
@@ -106,4 +107,6 @@ def _options(arguments: argparse.Namespace) -> "Options":
     options = Options() if arguments.config is None else config.load(arguments.config, Options)
     if arguments.returns is not None:
         options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, returns=arguments.returns))
+    if arguments.dark:
+        options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, dark=True))
     return perfect(options, arguments.perfect) if arguments.perfect else options

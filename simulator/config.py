@@ -30,6 +30,7 @@ class LidarOptions:
     )
     max_range_m: float = option(100.0, "no return from beyond [m]", minimum=1, maximum=131)
     airframe: bool = option(True, "legs and body return short ranges outside +-105 deg")
+    dark: bool = option(False, "cast no rays: only the airframe returns anything; quick, for tests of clocks and rates")
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,22 +141,31 @@ class Lidar:
         turn_deg = (self._azimuth_start_deg + 6.0 * self._options.rpm * time_s) % 360.0
         step_deg = 6.0 * self._options.rpm * FIRING_NS * 1e-9
         rng = generator(self._seed, "sweep", first_packet)
-        origins, directions, open_shots, echoes = self._cast(time_s, turn_deg, step_deg, rng, int(firing[0]) * LASERS)
-        ranges, strengths = self._returns(echoes, open_shots, turn_deg[:-1], step_deg, rng)
+        airframe_m = self._airframe(turn_deg[:-1], step_deg)
+        open_shots = airframe_m == 0.0
+        if self._options.dark:
+            open_shots[:] = False
+        origins, directions, echoes = self._cast(time_s, turn_deg, open_shots, rng, int(firing[0]) * LASERS)
+        ranges, strengths = self._returns(echoes, open_shots, airframe_m, rng)
         packets = self._pack(first_packet, count, turn_deg[:-1], ranges, strengths, rng)
         sent_s = time_s[self._firings :: self._firings]
         truth = self._truth(echoes, open_shots, origins, directions, self._clock.start_ns + elapsed_ns)
         return Sweep(packets, sent_s, truth)
 
     def _cast(
-        self, time_s: Array, turn_deg: Array, step_deg: float, rng: np.random.Generator, first_shot: int
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_], Array]:
-        """Middle ray of each open shot, which shots are open (n, 32), and their echoes (shots, 3, 4)."""
+        self,
+        time_s: Array,
+        turn_deg: Array,
+        open_shots: npt.NDArray[np.bool_],
+        rng: np.random.Generator,
+        first_shot: int,
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], Array]:
+        """Origin and direction of the middle of each open shot's beam, and their echoes (shots, 3, 4)."""
+        if not open_shots.any():
+            none = np.zeros((0, 3), np.float32)
+            return none, none, np.zeros((0, 3, 4))
         poses = self._flight.poses(time_s)
         mat = poses.mat_local_ins()
-        open_shots = np.ones((len(time_s) - 1, LASERS), np.bool_)
-        if self._options.airframe:
-            open_shots = self._airframe(turn_deg[:-1], step_deg) == 0.0
         rays = RAYS if self._options.footprint_mrad > 0 else 1
         origins, directions = aim(
             poses.position_m + mat @ self._lever_m,
@@ -185,40 +194,32 @@ class Lidar:
             self._threshold,
             self._options.max_range_m,
         )
-        return origins[::rays], directions[::rays], open_shots, echoes
+        return origins[::rays], directions[::rays], echoes
 
     def _airframe(self, turn_deg: Array, step_deg: float) -> Array:
-        """Airframe ranges of all shots, shape (n, 32)."""
+        """Airframe ranges of all shots [m], 0 where the view is free, shape (n, 32)."""
+        if not self._options.airframe:
+            return np.zeros((len(turn_deg), LASERS))
         azimuth = turn_deg[:, None] + step_deg * np.arange(LASERS) * LASER_NS / FIRING_NS
         return airframe_range(azimuth, ELEVATION_DEG)
 
     def _returns(
-        self,
-        echoes: Array,
-        open_shots: npt.NDArray[np.bool_],
-        turn_deg: Array,
-        step_deg: float,
-        rng: np.random.Generator,
+        self, echoes: Array, open_shots: npt.NDArray[np.bool_], airframe_m: Array, rng: np.random.Generator
     ) -> tuple[Array, Array]:
-        """Ranges with noise [m] and strengths, shape (n, 32, 2): even and odd block in dual mode, else the first counts."""
-        choice = echoes[:, [STRONGEST, STRONGEST]]
-        if self._mode == ReturnMode.LAST:
-            choice = echoes[:, [LAST, LAST]]
-        elif self._mode == ReturnMode.DUAL:
+        """Ranges with noise [m] and strengths, shape (n, 32, 1), or (n, 32, 2) in dual mode: even and odd block."""
+        if self._mode == ReturnMode.DUAL:
             choice = echoes[:, [LAST, STRONGEST]]
             strongest_is_last = echoes[:, LAST, RANGE] == echoes[:, STRONGEST, RANGE]
-            has_second = echoes[:, SECOND, RANGE] > 0
-            swap = strongest_is_last & has_second
+            swap = strongest_is_last & (echoes[:, SECOND, RANGE] > 0)
             choice[swap, 1] = echoes[swap, SECOND]
-        ranges = np.zeros((*open_shots.shape, 2))
-        strengths: Array = np.zeros(ranges.shape)
-        if self._options.airframe:
-            ranges[:] = self._airframe(turn_deg, step_deg)[..., None]
-            strengths[~open_shots] = _AIRFRAME_STRENGTH
+        else:
+            choice = echoes[:, [LAST if self._mode == ReturnMode.LAST else STRONGEST]]
+        ranges = np.repeat(airframe_m[..., None], choice.shape[1], axis=2)
+        strengths: Array = np.full(ranges.shape, _AIRFRAME_STRENGTH)
         ranges[open_shots], strengths[open_shots] = choice[..., RANGE], choice[..., STRENGTH]
         noise = self._options.range_noise_m * np.asarray(rng.standard_normal(ranges.shape))
-        same = ranges[..., 0] == ranges[..., 1]
-        noise[same, 1] = noise[same, 0]
+        same = ranges[..., -1] == ranges[..., 0]  # one echo in both blocks carries one noise
+        noise[same, -1] = noise[same, 0]
         noisy = ranges + noise + self._bias_m[:, None]
         return np.where(ranges > 0, np.maximum(noisy, RANGE_LSB_M), 0.0), strengths
 

@@ -17,6 +17,11 @@ from simulator.ins import Ins
 from simulator.scene import scene
 
 
+def dark(options):
+    """Without rays: quick."""
+    return replace(options, lidar=replace(options.lidar, dark=True))
+
+
 def with_link(options, **values):
     return replace(options, link=replace(options.link, **values))
 
@@ -25,7 +30,7 @@ def with_link(options, **values):
 def clean(simulate):
     """Perfect instruments, MAVLink 2, ATTITUDE at 100 Hz."""
     options = with_link(perfect(Options()), version=2, firmware="modern", extra1_hz=100, raw_sensors_hz=100)
-    return simulate("field", 6.0, options)
+    return simulate("field", 6.0, dark(options))
 
 
 def of_type(recorded, name):
@@ -180,7 +185,7 @@ def test_attitude_noise_is_of_the_size_asked_for():
 
 def test_a_reboot_is_silent_and_starts_another_clock_and_sequence(simulate):
     faults = FaultOptions(reboot_at_s=2.0, reboot_silence_s=1.0, garbage_per_s=5.0, lidar_gap_at_s=1.0, lidar_gap_s=0.5)
-    recorded = simulate("field", 5.0, replace(Options(), faults=faults))
+    recorded = simulate("field", 5.0, dark(replace(Options(), faults=faults)))
     stamps_ms = [m.time_boot_ms for _, m in of_type(recorded, "ATTITUDE")]
     back = np.flatnonzero(np.diff(stamps_ms) < 0)
     assert len(back) == 1

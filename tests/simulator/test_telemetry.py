@@ -15,6 +15,11 @@ from simulator.telemetry import rmc_sentence
 RECORDINGS = os.environ.get("SWATH_RECORDINGS")
 
 
+def dark(options):
+    """Without rays: quick."""
+    return replace(options, lidar=replace(options.lidar, dark=True))
+
+
 def words_of(payloads):
     return payloads[:, 14:38].copy().view("<u2").astype(np.int64)
 
@@ -38,7 +43,7 @@ def packets(field_flight):
 def clean(simulate):
     """No noise, lidar locked to GPS."""
     options = perfect(Options())
-    return simulate("field", 4.0, replace(options, clocks=replace(options.clocks, lidar_gps=True)))
+    return simulate("field", 4.0, dark(replace(options, clocks=replace(options.clocks, lidar_gps=True))))
 
 
 def test_words_carry_the_channel_tags_of_the_manual(packets):
@@ -93,14 +98,14 @@ def test_gyros_read_the_true_motion_on_the_axes_of_the_manual(clean, attitudes, 
 
 
 def test_accelerometers_at_rest_read_the_pull_of_gravity_on_their_axes(simulate):
-    still = simulate("panels", 1.0, perfect(Options()))
+    still = simulate("panels", 1.0, dark(perfect(Options())))
     accel_g = values_of(still.capture.payloads(512))[:, [2, 3, 6, 7, 10, 11]].mean(axis=0) * 0.001221
     # upright, [measured]: X of chips 1 and 2 reads +1 g, the level axes nothing
     assert accel_g == pytest.approx([1, 0, 1, 0, 0, 0], abs=0.0007)
 
 
 def test_zero_offsets_and_noise_are_those_asked_for(simulate):
-    still = simulate("panels", 3.0)
+    still = simulate("panels", 3.0, dark(Options()))
     gyros = values_of(still.capture.payloads(512))[:, [0, 4, 8]] * 0.09766
     sigma = np.hypot(1.1, 0.3 / np.sqrt(2))
     assert gyros.mean(axis=0) == pytest.approx([-23.1, -7.1, -12.3], abs=4 * sigma / np.sqrt(len(gyros)) + 0.02)
@@ -145,7 +150,7 @@ def test_statistics_are_of_the_size_of_a_real_recordings(simulate):
         frames.append(content[at + 16 : at + 16 + size])
         at += 16 + size
     real = np.frombuffer(b"".join(f[42:] for f in frames if len(f) == 554), np.uint8).reshape(-1, 512)
-    ours = simulate("panels", 3.0).capture.payloads(512)
+    ours = simulate("panels", 3.0, dark(Options())).capture.payloads(512)
     assert (words_of(real) // 4096 == words_of(ours)[0] // 4096).all()
     assert np.diff(stamps_us(ours)).mean() == pytest.approx(np.diff(stamps_us(real)).mean(), rel=0.15)
     # the real unit's second gyro is twice as noisy as the two others
