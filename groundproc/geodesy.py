@@ -132,7 +132,7 @@ def _grid_undulation(path: Path, latitude_deg: float, longitude_deg: float) -> f
         raise GeodesyError(f"geoid {path}: is neither a number [m] nor a grid file that is there")
     pipeline = (
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-        f"+step +inv +proj=vgridshift +grids={path.resolve()} +multiplier=1"
+        f'+step +inv +proj=vgridshift +grids="{path.resolve()}" +multiplier=1'
     )
     try:
         transformer = pyproj.Transformer.from_pipeline(pipeline)
