@@ -12,13 +12,13 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft, ndimage, signal, sparse
+from scipy import fft, ndimage, sparse
 from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import factorized
-from scipy.spatial.transform import Rotation
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SyncError
+from flightlog.frames import mat_from_quat, quat_exp
 
 Array = npt.NDArray[np.float64]
 
@@ -237,8 +237,9 @@ def _on_grid(track: GyroTrack, cutoff_hz: float) -> tuple[int, Array]:
     gap = np.maximum(1.0, 6.0 / max(track.rate_hz, 0.1))
     silent = seconds[before + 1] - seconds[before] > gap
     values[silent] = np.median(track.rate_rad_s, axis=0)
-    band = signal.butter(2, [HIGH_PASS_HZ, cutoff_hz], "bandpass", fs=GRID_HZ, output="sos")
-    values = signal.sosfiltfilt(band, values - np.median(values, axis=0), axis=0)
+    # Gaussian filters: no delay, no ringing, and a median first, so that huge offsets leave no steps at the ends
+    values = _low_pass(values - np.median(values, axis=0), cutoff_hz, GRID_HZ)
+    values = values - _low_pass(values, HIGH_PASS_HZ, GRID_HZ)
     values[silent] = 0.0
     return start, values
 
@@ -283,8 +284,13 @@ def _smooth_spline(track: GyroTrack, cutoff_hz: float) -> CubicSpline:
     seconds = (track.time_ns - track.time_ns[0]) * 1e-9
     grid = np.arange(0.0, seconds[-1] + 1.0 / FINE_HZ, 1.0 / FINE_HZ)
     values = np.stack([np.interp(grid, seconds, axis) for axis in track.rate_rad_s.T], axis=1)
-    sigma = FINE_HZ * np.sqrt(np.log(2.0) / 2.0) / (np.pi * cutoff_hz)  # half power at the cut-off
-    return CubicSpline(grid, ndimage.gaussian_filter1d(values, sigma, axis=0, mode="nearest"), axis=0)
+    return CubicSpline(grid, _low_pass(values, cutoff_hz, FINE_HZ), axis=0)
+
+
+def _low_pass(values: Array, cutoff_hz: float, rate_hz: float) -> Array:
+    """Gaussian low-pass with half power at the cut-off, along the first axis."""
+    sigma = rate_hz * np.sqrt(np.log(2.0) / 2.0) / (np.pi * cutoff_hz) / np.sqrt(2.0)
+    return np.asarray(ndimage.gaussian_filter1d(values, sigma, axis=0, mode="nearest"))
 
 
 # Least squares --------------------------------------------------------------------------------------------------------
@@ -319,7 +325,7 @@ def _fit(lidar: GyroTrack, ins: GyroTrack, peak: _Peak, cutoff_hz: float, mat_mo
         score = np.einsum("nki,nk,nk->i", jacobian, weight, residual)
         step = np.linalg.solve(normal, score - prior * np.array([0.0, shift[1], 0.0, 0.0, 0.0]))
         shift = shift + step[:2]
-        rotation = Rotation.from_rotvec(step[2:]).as_matrix() @ rotation
+        rotation = mat_from_quat(quat_exp(step[2:])) @ rotation
         if abs(step[0]) < 1e-7 and np.abs(step[2:]).max() < 1e-6:
             break
     covariance = _covariance(time_s, np.einsum("nki,nk,nk->ni", jacobian, weight, residual), normal)

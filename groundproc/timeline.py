@@ -213,7 +213,7 @@ def _gyro_sync(run: LidarRun, boot: Boot, mat_ins_lidar: Array, expected_ns: int
     if not results:
         raise reasons[0]
     sharpest = min(results, key=lambda result: result.sigma_offset_ns)
-    chosen = next(r for r in results if r.sigma_offset_ns <= 2.0 * sharpest.sigma_offset_ns)
+    chosen = next(r for r in results if r.sigma_offset_ns <= 4.0 * sharpest.sigma_offset_ns)
     apart = max(abs(r.offset_ns - chosen.offset_ns) for r in results)
     apart = (
         apart if apart < 20_000_000 else 0

@@ -1,7 +1,7 @@
 """Pictures of a cloud, straight from the points: seen from above by height and by intensity, and from the side."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +10,9 @@ from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]
 
-LARGEST_SAMPLE: Final = 2_000_000
+LARGEST_SAMPLE: Final = 1_000_000
 """Points kept for the pictures, however long the flight."""
-PIXELS: Final = 1000
+PIXELS: Final = 900
 
 
 class CloudSample:
@@ -43,43 +43,50 @@ def draw_cloud(folder: Path, sample: CloudSample, crs_name: str) -> None:
     """Write cloud_height.png and cloud_intensity.png."""
     xyz, intensity = sample.points()
     low, high = np.percentile(xyz[:, 2], [1, 99.5])
+    top = max(float(np.percentile(intensity, 99)), 1.0)
     _draw(folder / "cloud_height.png", xyz, xyz[:, 2], (float(low), float(high)), "height [m]", "viridis", crs_name)
-    top = float(max(np.percentile(intensity, 99), 1))
     _draw(folder / "cloud_intensity.png", xyz, intensity.astype(np.float64), (0.0, top), "intensity", "gray", crs_name)
 
 
 def _draw(
     path: Path, xyz: Array, value: Array, limits: tuple[float, float], label: str, colours: str, crs_name: str
 ) -> None:
+    """A plan above an elevation seen from the south, to one scale."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    low, high = np.percentile(xyz, [0.2, 99.8], axis=0)
+    low, high = np.percentile(xyz, [0.3, 99.7], axis=0)
     low, high = low - 1.0, high + 1.0
-    size = high - low
-    figure, (plan, side) = plt.subplots(
-        2, 1, figsize=(12, 12 * min(2.0, (size[1] + size[2] + 4) / size[0] + 0.15)), constrained_layout=True,
-        height_ratios=[size[1], max(size[2] * 1.5, 0.15 * size[1])],
-    )  # fmt: skip
-    image: Any = None
-    for axes, across, up, depth, names in (
-        (plan, 0, 1, 2, ("easting [m]", "northing [m]")),
-        (side, 0, 2, 1, ("easting [m]", "height [m]")),
-    ):
-        pixel = max(size[across], size[up]) / PIXELS
-        # from above the highest point is seen, from the south the nearest
-        order = np.argsort(xyz[:, depth] if axes is plan else -xyz[:, depth], kind="stable")
-        raster = _raster(xyz[order][:, [across, up]], value[order], low[[across, up]], high[[across, up]], pixel)
-        extent = (low[across], high[across], low[up], high[up])
-        image = axes.imshow(raster, extent=extent, origin="lower", cmap=colours, vmin=limits[0], vmax=limits[1])
-        axes.set(xlabel=names[0], ylabel=names[1], facecolor="#10131a")
+    width, depth, rise = high - low
+    pixel = max(width, depth) / PIXELS
+    inches = 9.0 / max(width, depth)
+    plan, side = (width * inches, depth * inches), (width * inches, rise * inches)
+    size = (plan[0] + 2.6, plan[1] + side[1] + 2.2)
+    figure = plt.figure(figsize=size, dpi=100)
+    left = 1.2 / size[0]
+    panels = (
+        # from above the highest point of a pixel is seen, from the south the nearest
+        ((left, (side[1] + 1.4) / size[1], plan[0] / size[0], plan[1] / size[1]), (0, 1), 2, 1.0, "northing [m]"),
+        ((left, 0.6 / size[1], side[0] / size[0], side[1] / size[1]), (0, 2), 1, -1.0, "height [m]"),
+    )
+    for place, shown, deep, sign, name in panels:
+        axes = figure.add_axes(place, facecolor="#10131a")
+        order = np.argsort(sign * xyz[:, deep], kind="stable")
+        corner = list(shown)
+        raster = _raster(xyz[order][:, corner], value[order], low[corner], high[corner], pixel)
+        extent = (low[shown[0]], high[shown[0]], low[shown[1]], high[shown[1]])
+        image = axes.imshow(
+            raster, extent=extent, origin="lower", cmap=colours, vmin=limits[0], vmax=limits[1], interpolation="nearest"
+        )
+        axes.set(xlabel="easting [m]", ylabel=name)
         axes.ticklabel_format(useOffset=False, style="plain")
-    plan.set_title(f"from above and from the south, {crs_name}")
-    figure.colorbar(image, ax=(plan, side), label=label, shrink=0.6)
+    figure.axes[0].set_title(f"from above; below, from the south; {crs_name}")
+    bar = figure.add_axes((left + (plan[0] + 0.3) / size[0], panels[0][0][1], 0.2 / size[0], plan[1] / size[1]))
+    figure.colorbar(image, cax=bar, label=label)
     with written_aside(path) as aside:
-        figure.savefig(aside, format="png", dpi=100)
+        figure.savefig(aside, format="png")
     plt.close(figure)
 
 
