@@ -101,12 +101,25 @@ def from_poses(
     sigma_rad: Array,
 ) -> Trajectory:
     """A trajectory through poses, shape (n, ...), with velocities and rates from their differences; steps over 1 s are gaps."""
-    seconds = (time_ns - time_ns[0]) * 1e-9
-    velocity = np.gradient(position_m, seconds, axis=0)
-    turn = frames.quat_log(frames.quat_multiply(frames.quat_inverse(quat[:-1]), quat[1:])) / np.diff(seconds)[:, None]
-    rate = np.concatenate([turn[:1], 0.5 * (turn[:-1] + turn[1:]), turn[-1:]])
-    covered = np.append(np.diff(time_ns) <= LONGEST_STEP_NS, False)
+    step_s = np.diff(time_ns) * 1e-9
+    joined = np.diff(time_ns) <= LONGEST_STEP_NS
+    velocity = _at_knots(np.diff(position_m, axis=0) / step_s[:, None], step_s, joined)
+    turn = frames.quat_log(frames.quat_multiply(frames.quat_inverse(quat[:-1]), quat[1:])) / step_s[:, None]
+    rate = _at_knots(turn, step_s, joined)
+    covered = np.append(joined, False)
     return Trajectory(frame, time_ns, position_m, velocity, quat, rate, sigma_position_m, sigma_rad, covered)
+
+
+def _at_knots(slope: Array, step_s: Array, joined: npt.NDArray[np.bool_]) -> Array:
+    """Slopes at knots, shape (n, 3), from those of the steps between, shape (n - 1, 3): the parabola's; one-sided at a gap."""
+    weight = np.where(joined, 1.0 / step_s, 0.0)[:, None]
+    total = np.zeros((len(slope) + 1, 1))
+    total[:-1] += weight
+    total[1:] += weight
+    summed = np.zeros((len(slope) + 1, slope.shape[1]))
+    summed[:-1] += weight * slope
+    summed[1:] += weight * slope
+    return np.asarray(summed / np.where(total > 0.0, total, 1.0))
 
 
 def _sigmas(column: dict[str, Array], names: tuple[str, ...]) -> Array:
@@ -116,26 +129,40 @@ def _sigmas(column: dict[str, Array], names: tuple[str, ...]) -> Array:
 
 
 def _read(path: Path) -> tuple[list[str], npt.NDArray[np.int64], Array]:
+    """Names of the columns that mean something here, stamps, and the values, shape (n, names)."""
     with path.open(encoding="utf-8", errors="replace") as file:
-        names = file.readline().strip().split(",")
-        if "utc_ns" not in names:
+        header = [name.strip() for name in file.readline().split(",")]
+        if "utc_ns" not in header:
             raise LogError(f"{path}: the first line has no column utc_ns; a trajectory has {', '.join(COLUMNS[:10])}")
-        where = names.index("utc_ns")
+        names: list[str] = [name for name in COLUMNS if name in header]
+        places = [header.index(name) for name in names]
         stamps, rows = [], []
         for number, line in enumerate(file, 2):
             words = line.strip().split(",")
             if words == [""]:
                 continue
-            if len(words) != len(names) or (row := _numbers(words, where)) is None:
-                raise LogError(f"{path}: line {number} is not {len(names)} numbers, utc_ns a whole one")
+            row = _numbers([words[place] for place in places], names) if len(words) == len(header) else None
+            if row is None:
+                raise LogError(
+                    f"{path}: line {number} is not {len(header)} values, utc_ns a whole number and the pose one that can be"
+                )
             stamps.append(row[0])
             rows.append(row[1])
     return names, np.array(stamps, np.int64), np.array(rows, np.float64).reshape(len(rows), len(names))
 
 
-def _numbers(words: list[str], stamp: int) -> tuple[int, list[float]] | None:
-    """The stamp, exactly, and all values of a row; None where one is no number."""
+def _numbers(words: list[str], names: list[str]) -> tuple[int, list[float]] | None:
+    """The stamp, exactly, and all values of a row, the stamp first; None where one is no number or no pose."""
     try:
-        return int(words[stamp]), [float(word) for word in words]
+        stamp, values = int(words[0]), [float(word) for word in words]
     except ValueError:
         return None
+    for name, value in zip(names, values, strict=True):
+        # a sigma may be missing
+        if not name.startswith("sigma") and not abs(value) <= _LARGEST.get(name, 1e9):
+            return None
+    return stamp, values
+
+
+_LARGEST: Final = {"utc_ns": 2.0**62, "latitude_deg": 90.0, "longitude_deg": 360.0}
+"""Magnitudes that values of a pose cannot exceed."""
