@@ -164,7 +164,7 @@ def _paced(events: Iterator[_Event], played: Played, progress: Callable[[float],
         if start_s is None or first_ns is None:
             start_s, first_ns = time.monotonic(), event.time_ns
         due_s = (event.time_ns - first_ns) / NS_PER_S
-        if due_s > now_s + _SLICE_S or due_s > now_s:
+        if due_s > now_s:
             now_s = time.monotonic() - start_s
             if due_s > now_s:
                 time.sleep(max(due_s - now_s, _SLICE_S))
