@@ -246,10 +246,17 @@ def run_swathd(
             process, lambda: send(rate, seconds, port, dual=dual, mavlink_port=mavlink_port if mavlink else 0)
         )
     logged = 0
+    kernel_drops = queue_drops = 0
     with LogReader(next(logs.glob("*.mcap"))) as log:
         for message in log.messages((records.LIDAR_ACCOUNT.topic,)):
             account = records.decode_account(message.data)
             logged += account.kept + account.masked_packets
+            kernel_drops += account.kernel_drops
+            queue_drops += account.queue_drops
+    if kernel_drops or queue_drops:
+        print(
+            f"swathd counted {kernel_drops} packets dropped by the kernel and {queue_drops} that the disk did not take"
+        )
     return Run(run.sent, run.seconds, run.cpu_s, logged, run.memory_mb)
 
 

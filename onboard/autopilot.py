@@ -290,6 +290,7 @@ class Link(Worker):
                     source.write(data)
             self.progress()
             self.pause(source.pause_s)
+        self._chunks += source.read()
 
     def _hand_over(self) -> None:
         """Give the chunks to the recorder, and have a look at the frames in them."""

@@ -4,6 +4,7 @@ import logging
 import os
 import platform
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -115,6 +116,8 @@ class Daemon:
         SwathError
             A worker died; the log was closed as well as could be.
         """
+        # A thread that computes gives way after 1 ms instead of 5: the lidar's must not wait for the writer's.
+        sys.setswitchinterval(0.001)
         for worker in reversed(self._workers):
             worker.start()
         _log.info("recording to %s", self._directory / self._segment_name)

@@ -29,8 +29,8 @@ _DATA_SLOTS: Final = 512
 _SMALL_BUFFER_BYTES: Final = 1 << 20
 _SMALL_BUFFER_POLL_S: Final = 0.02
 """Debian's default buffer holds 50 ms of packets."""
-_BUSY_POLL_S: Final = 0.005
-"""After a poll that filled all slots: packets come so fast that the usual pause would eat up the buffer."""
+_IDLE_POLL_S: Final = 0.02
+"""While nothing comes: what comes next may come at any rate."""
 _POSITION_SLOTS: Final = 128
 
 Put = Callable[[str, int, bytes, bool], bool]
@@ -124,13 +124,16 @@ class LidarPort(Worker):
         """Poll until asked to stop, then hand over what is left."""
         try:
             position_due_ns = 0
+            before_ns = time.monotonic_ns()
             while not self.stopping:
-                busy = self._poll(self._data, self._close_data)
-                self.progress()
-                if self.progress_ns >= position_due_ns:
+                found = self._poll(self._data, self._close_data)
+                now_ns = time.monotonic_ns()
+                if now_ns >= position_due_ns:
                     self._poll(self._position, self._close_position)
-                    position_due_ns = self.progress_ns + BATCH_NS // 2
-                time.sleep(_BUSY_POLL_S if busy else self._poll_s)
+                    position_due_ns = now_ns + BATCH_NS // 2
+                self.progress()
+                time.sleep(self._pause_s(found, now_ns - before_ns))
+                before_ns = now_ns
             self._poll(self._data, self._close_data)
             self._poll(self._position, self._close_position)
             for batch in (self._data, self._position):
@@ -140,16 +143,22 @@ class LidarPort(Worker):
         finally:
             self.close()
 
-    def _poll(self, batch: "_Batch", close: "Callable[[_Batch], None]") -> bool:
-        """Empty a socket; True if there was more than the slots hold."""
-        busy = False
-        while not batch.fill() and not self.stopping:  # full, and there may be more
+    def _pause_s(self, found: int, within_ns: int) -> float:
+        """How long to wait after a poll, so that at this rate of packets the next one finds no more than the slots hold."""
+        if not found:
+            return min(self._poll_s, _IDLE_POLL_S)
+        return min(self._poll_s, _DATA_SLOTS * within_ns / (found * NS_PER_S))
+
+    def _poll(self, batch: "_Batch", close: "Callable[[_Batch], None]") -> int:
+        """Empty a socket; gives the number of datagrams found."""
+        found = batch.fill()
+        while batch.full and not self.stopping:  # there may be more
             close(batch)
             self.progress()
-            busy = True
+            found += batch.fill()
         if batch.due():
             close(batch)
-        return busy
+        return found
 
     # Data packets -------------------------------------------------------------------------------------------------
 
@@ -260,8 +269,13 @@ class _Batch:
         self._kernel_time = KernelTime(log_time, self._now)
         self.receiver = Receiver(sock, self._slots, offset, size)
 
-    def fill(self) -> bool:
-        """Take what is waiting; True if that was everything, False if the slots are full."""
+    @property
+    def full(self) -> bool:
+        """Whether no slot is left."""
+        return self._count == len(self._slots)
+
+    def fill(self) -> int:
+        """Take what is waiting, as far as there are slots; gives the number of datagrams."""
         first = self._count
         count = self.receiver.receive(first)
         if count:
@@ -273,7 +287,7 @@ class _Batch:
                 stamps_ns, self._now, emptied=first + count < len(self._slots)
             )
             self._count += count
-        return self._count < len(self._slots)
+        return count
 
     def due(self) -> bool:
         """Whether what is in here will be as old as a message may be before anyone looks again."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from flightlog import __version__
-from flightlog.constants import NS_PER_MS
+from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from flightlog.logfile import LogWriter
 from onboard.config import RecorderConfig
@@ -24,6 +24,12 @@ _log = logging.getLogger(__name__)
 
 _RESERVE_BYTES: Final = 4 << 20
 """Room of the backlog beyond its limit that only small messages may use, so that a stalled disk costs lidar packets first."""
+
+
+_SLICE_NS: Final = 100 * NS_PER_MS
+"""Writing goes on for at least this long between two syncs, however late the last one was."""
+_PRESSING: Final = 4
+"""The backlog presses when it has grown to this part of its limit."""
 
 
 class _Item(NamedTuple):
@@ -46,6 +52,8 @@ class Backlog:
         self._lock = threading.Lock()
         self.size_bytes = 0
         self.refused = 0
+        self.pressing = threading.Event()
+        """Set when the writer should not wait any longer."""
 
     def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
         """Append a message; False if there is no room. A vital one may use the reserve."""
@@ -55,7 +63,9 @@ class Backlog:
                 return False
             self._items.append(_Item(topic, log_time_ns, data))
             self.size_bytes += len(data)
-            return True
+        if self.size_bytes > self._limit_bytes // _PRESSING:
+            self.pressing.set()
+        return True
 
     def get(self) -> _Item | None:
         """Take the oldest message, None if there is none."""
@@ -156,7 +166,7 @@ class Recorder(Worker):
     def __init__(self, config: RecorderConfig, segment: Segment) -> None:
         super().__init__("recorder")
         self._segment = segment
-        self._sync_s = config.sync_ms / 1e3
+        self._sync_ns = config.sync_ms * NS_PER_MS
         self.backlog = Backlog(config.backlog_mb << 20)
         self.counts = RecorderCounts(segment=segment.path.name, last_sync_ns=time.monotonic_ns())
 
@@ -168,18 +178,31 @@ class Recorder(Worker):
         """Write and sync until asked to stop; what is in the backlog then is still written."""
         try:
             while not self.stopping:
-                self._write_all()
-                self._sync()
+                self._write_until(self.counts.last_sync_ns + self._sync_ns)
+                if time.monotonic_ns() >= self.counts.last_sync_ns + self._sync_ns:
+                    self._sync()
                 self.progress()
-                self.pause(self._sync_s)
-            self._write_all()
+                left_ns = self.counts.last_sync_ns + self._sync_ns - time.monotonic_ns()
+                self.backlog.pressing.wait(max(0.0, left_ns / NS_PER_S))
+                self.backlog.pressing.clear()
+            self._write_until(None)
         finally:
             self._segment.close()
 
-    def _write_all(self) -> None:
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Ask it to end and wait for that."""
+        self._stop_asked.set()
+        self.backlog.pressing.set()
+        super().stop(timeout_s)
+
+    def _write_until(self, end_ns: int | None) -> None:
+        """Write the backlog; not beyond a time of the monotonic clock [ns] even if more and more comes."""
+        begin_ns = time.monotonic_ns()
         while (item := self.backlog.get()) is not None:
             self._segment.write(item.topic, item.log_time_ns, item.data)
             self.counts.messages += 1
+            if end_ns is not None and time.monotonic_ns() >= max(end_ns, begin_ns + _SLICE_NS):
+                break
 
     def _sync(self) -> None:
         begin_ns = time.monotonic_ns()
