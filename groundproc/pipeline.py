@@ -179,7 +179,9 @@ def cloud_crs(projection: geodesy.Projection, survey: Survey) -> Any:
 
 def project(points: Points, projection: geodesy.Projection) -> None:
     """Put points into the projected CRS, in place."""
-    polynomial = projection.polynomial(points.xyz_m.min(axis=0), points.xyz_m.max(axis=0))
+    # column by column: numpy reduces three short rows at a time ten times as slowly
+    low, high = (np.array([extreme(axis) for axis in points.xyz_m.T]) for extreme in (np.min, np.max))
+    polynomial = projection.polynomial(low, high)
     georeference.project(points.xyz_m, polynomial)
 
 

@@ -78,7 +78,7 @@ class CloudWriter:
         gps: bool = True,
         about: str = "Velodyne HDL-32E",
     ) -> None:
-        header = laspy.LasHeader(version="1.4", point_format=6)
+        header = _Header(version="1.4", point_format=6)
         header.add_extra_dims([_extra(extra) for extra in extras])
         header.scales, header.offsets = np.full(3, SCALE_M), np.asarray(offset_m, np.float64)
         header.generating_software, header.system_identifier = f"swath {__version__}"[:31], about[:31]
@@ -113,6 +113,8 @@ class CloudWriter:
         self._thread.join()
         if self._error is None:
             self._las.close()
+        else:
+            self._las.dest.close()
         if self._error is not None and error is None:
             raise self._error
 
@@ -149,6 +151,20 @@ class CloudWriter:
                 self._las.write_points(laspy.PackedPointRecord(points, self._header.point_format))
             except BaseException as error:  # handed to the producer, whatever it is
                 self._error = error
+
+
+class _Header(laspy.LasHeader):
+    """A header that counts returns by bins: laspy sorts all of them, a tenth of the time of the whole pipeline."""
+
+    def grow(self, points: laspy.PackedPointRecord) -> None:
+        """Take extent and counts of points."""
+        array = points.array
+        scaled = [(array[name].min(), array[name].max()) for name in "XYZ"]
+        low, high = (np.array(values) * self.scales + self.offsets for values in zip(*scaled, strict=True))
+        self.mins, self.maxs = np.minimum(self.mins, low), np.maximum(self.maxs, high)
+        counts = np.bincount(array["bit_fields"] & 0x0F, minlength=16)[1:]
+        self.number_of_points_by_return += counts.astype(self.number_of_points_by_return.dtype)
+        self.point_count += len(array)
 
 
 def _extra(extra: ExtraBytes) -> laspy.ExtraBytesParams:

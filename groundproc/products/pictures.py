@@ -10,7 +10,7 @@ from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]
 
-LARGEST_SAMPLE: Final = 1_000_000
+LARGEST_SAMPLE: Final = 500_000
 """Points kept for the pictures, however long the flight."""
 PIXELS: Final = 900
 
