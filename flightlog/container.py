@@ -186,13 +186,25 @@ def check_message_index(head: bytes, size: int) -> None:
 
 FOOTER_BYTES: Final = RECORD_HEAD.size + 20 + len(MAGIC)
 """Footer and magic at the very end of a finished file."""
+FOOTER_CHECKED_BYTES: Final = RECORD_HEAD.size + 16
+"""As much of the footer as its checksum covers."""
 
 
-def footer(tail: bytes) -> int | None:
-    """Where the summary starts (0: there is none), by the last FOOTER_BYTES of a file; None where they are no footer."""
+class Footer(NamedTuple):
+    """The last record of a finished file."""
+
+    summary_start: int
+    """0: there is no summary."""
+    crc: int
+    """Of the summary and of the footer before this field, 0: none."""
+
+
+def footer(tail: bytes) -> Footer | None:
+    """Parse the last FOOTER_BYTES of a file; None where they are no footer."""
     if len(tail) != FOOTER_BYTES or RECORD_HEAD.unpack_from(tail) != (Opcode.FOOTER, 20) or not tail.endswith(MAGIC):
         return None
-    return int(struct.unpack_from("<Q", tail, RECORD_HEAD.size)[0])
+    summary_start, _, crc = struct.unpack_from("<QQI", tail, RECORD_HEAD.size)
+    return Footer(summary_start, crc)
 
 
 def _check_end(content: bytes, offset: int) -> None:

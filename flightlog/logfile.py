@@ -4,7 +4,9 @@ The container is MCAP (mcap.dev/spec). Writing is the mcap library's; reading is
 damaged byte, and a log from a crash is the one that matters most.
 """
 
+import json
 import struct
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +22,7 @@ from flightlog.records import FORMAT_VERSION, record_type
 from flightlog.walk import ChunkAt, Hole, Walk
 
 _TOPICS: Final = "swath.topics"
+_CHECK: Final = "crc32"
 
 _QOS: Final = (
     "- history: 1\n  depth: 10\n  reliability: 1\n  durability: 2\n"
@@ -111,12 +114,18 @@ class LogWriter:
         """
         self._flushes += 1
         if self._channels and self._flushes & (self._flushes - 1) == 0:
-            self.add_metadata(_TOPICS, {str(number): topic for topic, number in self._channels.items()})
+            topics = {str(number): topic for topic, number in self._channels.items()}
+            self.add_metadata(_TOPICS, topics | {_CHECK: _check_value(topics)})
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self) -> None:
         """Write summary and footer. The stream stays open."""
         self._writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _check_value(topics: Mapping[str, str]) -> str:
+    """Checksum of what channel number means which topic, in hexadecimal."""
+    return f"{zlib.crc32(json.dumps(topics, sort_keys=True).encode()):08x}"
 
 
 def _media_type(name: str) -> str:
@@ -255,11 +264,17 @@ class LogReader:
             elif isinstance(found, container.Attachment):
                 self.attachments[found.name] = found.data
             else:
-                self.metadata[found.name] = found.values
+                self._keep_metadata(found)
         self.damage.truncated = not walk.finished
         if loose and not self._chunks and not self.metadata:
             raise LogError(f"{self.path}: holds messages outside of chunks, which no flight log does")
-        self._topics |= {int(n): topic for n, topic in self.metadata.get(_TOPICS, {}).items() if n.isdecimal()}
+
+    def _keep_metadata(self, found: container.Metadata) -> None:
+        self.metadata[found.name] = found.values
+        if found.name == _TOPICS:  # MCAP gives metadata no checksum, and a wrong topic is worse than none
+            topics = {number: topic for number, topic in found.values.items() if number != _CHECK}
+            if found.values.get(_CHECK) == _check_value(topics):
+                self._topics |= {int(number): topic for number, topic in topics.items()}
 
     def _read(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
@@ -295,6 +310,8 @@ class LogReader:
             try:
                 opcode, size = RECORD_HEAD.unpack_from(content, offset)
                 offset += RECORD_HEAD.size
+                if offset + size > end:
+                    raise container.RecordError("a record that runs out of its chunk")
                 if opcode == Opcode.CHANNEL:
                     number, topic = container.channel(content[offset : offset + size])
                     self._topics[number] = topic

@@ -1,5 +1,6 @@
 """A walk over the top level of an MCAP file, record by record, that steps over what is damaged and finds its way back."""
 
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import BinaryIO, Final, NamedTuple
@@ -50,11 +51,15 @@ class Walk:
     """
 
     def __init__(self, file: BinaryIO, size: int) -> None:
-        self._file, self._size = file, size
-        summary = container.footer(self._read(max(0, size - container.FOOTER_BYTES), container.FOOTER_BYTES))
-        self.finished = summary is not None
+        self._file = file
+        footer = container.footer(self._read(max(0, size - container.FOOTER_BYTES), container.FOOTER_BYTES))
+        self.finished = footer is not None
         self._end = size - container.FOOTER_BYTES if self.finished else size
-        self._summary = summary or self._end
+        self._summary, self._summary_good = self._end, True
+        if footer is not None and 0 < footer.summary_start < self._end:
+            self._summary = footer.summary_start
+            crc = self._crc(footer.summary_start, self._end + container.FOOTER_CHECKED_BYTES) if footer.crc else 0
+            self._summary_good = crc == footer.crc
         self._in_summary = False
 
     def __iter__(self) -> Iterator[Found]:
@@ -69,12 +74,20 @@ class Walk:
             offset, found = record
             if isinstance(found, Opcode):
                 self._in_summary = self._in_summary or found is Opcode.DATA_END
-            else:
+            elif self._summary_good or not self._in_summary:
                 yield found
+        if not self._summary_good:  # what it says of channels may be wrong, and where it starts too
+            yield Hole(self._end, container.FOOTER_BYTES, False)
 
     def _read(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
         return self._file.read(size)
+
+    def _crc(self, start: int, end: int) -> int:
+        crc = 0
+        for offset in range(start, end, _WINDOW):
+            crc = zlib.crc32(self._read(offset, min(_WINDOW, end - offset)), crc)
+        return crc
 
     def _claimed_end(self, head: bytes, offset: int) -> int | None:
         """Where the record at `offset` says that it ends, None where that is beyond the end."""

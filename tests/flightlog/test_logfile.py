@@ -3,12 +3,15 @@ import os
 import struct
 import subprocess
 import sys
+import tempfile
 import zlib
 from pathlib import Path
 
 import lz4.frame
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
@@ -88,6 +91,10 @@ def whole(messages: Read) -> bytes:
 @pytest.fixture
 def log_file(tmp_path: Path) -> Path:
     return tmp_path / "flight.mcap"
+
+
+_MESSAGES = messages_of(4)
+_MIXED = written(_MESSAGES)
 
 
 # A whole log ----------------------------------------------------------------------------------------------------------
@@ -324,6 +331,33 @@ def test_the_rest_of_a_damaged_log_stays_readable_to_the_last_metadata(log_file:
     assert read(log_file)[1].metadata["swath.end"] == {"reason": "SIGTERM"}
 
 
+@given(st.data())
+def test_any_mixture_of_damage_gives_whole_messages_and_no_error_but_a_log_error(draw: st.DataObject) -> None:
+    data = bytearray(_MIXED)
+    for _ in range(draw.draw(st.integers(1, 6))):
+        place = draw.draw(st.integers(8, len(data) - 1))
+        kind = draw.draw(st.sampled_from(["flip", "zero", "insert", "delete", "repeat"]))
+        size = draw.draw(st.integers(1, 300))
+        if kind == "flip":
+            data[place] ^= size % 255 + 1
+        elif kind == "zero":
+            data[place : place + size] = bytes(len(data[place : place + size]))
+        elif kind == "delete":
+            del data[place : place + size]
+        else:
+            data[place:place] = draw.draw(st.binary(max_size=30)) if kind == "insert" else data[place : place + size]
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data)
+        file.flush()
+        try:
+            ours, log = read(Path(file.name))
+        except LogError:
+            return
+    assert all(message in _MESSAGES for message in ours)
+    if len(ours) < len(_MESSAGES):
+        assert log.damage
+
+
 def test_random_bytes_behind_the_magic_are_a_damaged_log(log_file: Path) -> None:
     random = np.random.default_rng(5)
     for size in (1, 8, 9, 100, 5000):
@@ -385,6 +419,20 @@ def test_a_bag_of_another_program_is_read_too(log_file: Path, compression: Compr
     assert not log.damage
     assert [topic for topic, _, _ in ours] == ["/chatter"] * 20 + ["/velodyne_packets"] * 20
     assert log.metadata == {}
+
+
+def test_a_chunk_without_checksum_whose_records_do_not_add_up_is_damage(log_file: Path) -> None:
+    foreign(log_file, CompressionType.NONE, crcs=False)
+    data = bytearray(log_file.read_bytes())
+    offset = chunks_of(bytes(data))[2][0] + 9 + 28 + 4 + 8  # the first record in an unpacked chunk
+    opcode, size = struct.unpack_from("<BQ", data, offset)
+    assert opcode == 5
+    struct.pack_into("<Q", data, offset + 1, size + 10_000)
+    log_file.write_bytes(data)
+    ours, log = read(log_file)
+    assert 0 < len(ours) < 40
+    assert all(len(message[2]) == 24 for message in ours)
+    assert log.damage.bad_chunks == 1
 
 
 def test_a_bag_without_chunks_is_refused_and_not_taken_for_empty(log_file: Path) -> None:
