@@ -153,8 +153,11 @@ class CloudWriter:
                 self._error = error
 
 
-class _Header(laspy.LasHeader):
+class _Header(laspy.LasHeader):  # type: ignore[misc]  # laspy has no types that mypy would see
     """A header that counts returns by bins: laspy sorts all of them, a tenth of the time of the whole pipeline."""
+
+    mins: npt.NDArray[np.float64]
+    maxs: npt.NDArray[np.float64]
 
     def grow(self, points: laspy.PackedPointRecord) -> None:
         """Take extent and counts of points."""
