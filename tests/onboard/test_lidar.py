@@ -132,12 +132,13 @@ def test_what_the_recorder_refuses_is_counted_in_the_account(monterey_data: list
     assert session.port.counts.queue_drops == 300
 
 
-def test_packets_of_a_prototype_that_calls_itself_an_hdl32e_are_taken_as_such(vlp16_data: list[bytes]) -> None:
-    # byte 1205 says 0x21: nothing in the packet tells the model, and refusing would refuse real ones too
+def test_a_recorded_vlp16_is_told_by_name_and_never_reaches_the_log(vlp16_data: list[bytes]) -> None:
     session = Session()
-    session.send(vlp16_data[:20])
-    assert session.account().received == 20
-    assert session.account().kept + session.account().rejected_content == 20
+    session.send(vlp16_data)
+    assert session.of(records.LIDAR.topic) == []
+    assert session.account() == LidarAccount(received=len(vlp16_data), rejected_content=len(vlp16_data))
+    assert session.port.counts.rejected == {"data packet of another sensor: VLP-16": len(vlp16_data)}
+    assert session.port.counts.newest_ns == 0  # no sign of an HDL-32E
 
 
 def test_a_batch_spans_about_a_tenth_of_a_second(monterey_data: list[bytes]) -> None:
