@@ -212,7 +212,9 @@ def decode_scan(data: bytes | memoryview) -> npt.NDArray[np.void]:
     if len(data) < expected:
         raise LogError(f"{LIDAR.topic}: {count} packets need {expected} bytes, the record has {len(data)}")
     out = np.empty(count, SCAN_PACKET_DTYPE)
-    out.view(np.uint8)[: expected - offset] = np.frombuffer(data, np.uint8, expected - offset, offset)
+    plain = out.view(np.uint8)
+    plain[: expected - offset] = np.frombuffer(data, np.uint8, expected - offset, offset)
+    plain[expected - offset :] = 0
     return out
 
 

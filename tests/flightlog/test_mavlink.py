@@ -25,6 +25,8 @@ def witness(request: pytest.FixtureRequest, recordings: Path) -> Witness:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MAVLINK20", "1")
         from pymavlink import mavutil
+
+        mavutil.set_dialect("ardupilotmega")  # by the environment as it is now, whoever imported it before
     log = mavutil.mavlogfile(str(recordings / "mavlink" / request.param))
     stream, messages = [], []
     while (message := log.recv_msg()) is not None:
