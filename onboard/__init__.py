@@ -8,7 +8,8 @@ timesync     log time from the host's clocks; kernel receive times through a ste
 health       the status of everything, and the verdict on it (pure)
 datagrams    many datagrams of a socket in one system call, with the kernel's receive times and drop counts
 lidar        the HDL-32E's two ports -> batches
-autopilot    MAVLink links, serial or UDP -> raw chunks; asks for the streams
+sources      the serial device or UDP port of a MAVLink link
+autopilot    MAVLink links -> raw chunks; asks for the streams
 recorder     bounded backlog -> segments of the flight log, synced to the disk twice a second
 worker       a thread whose progress is watched
 notify       word to systemd

@@ -4,17 +4,11 @@ The link may come and go: it is opened again and again, and the rest of the daem
 """
 
 import logging
-import os
 import select
-import socket
-from abc import ABC, abstractmethod
 from collections import Counter
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
-import numpy as np
-import serial
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import records
@@ -22,9 +16,9 @@ from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import SourceError
 from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser, decode
 from onboard.config import LinkConfig, StreamsConfig
-from onboard.datagrams import Receiver, open_udp
 from onboard.lidar import Put
-from onboard.timesync import Clocks, KernelTime, LogTime, read_clocks
+from onboard.sources import Chunk, Source, UdpSource, open_source
+from onboard.timesync import LogTime, read_clocks
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -32,15 +26,7 @@ _log = logging.getLogger(__name__)
 BATCH_NS: Final = 100 * NS_PER_MS
 """A message of the log spans about this much."""
 _WAIT_S: Final = 0.1
-_SERIAL_PAUSE_S: Final = 0.005
-"""Between two reads: bounds the wake-ups, and how much later than its last byte a frame may be stamped."""
-_UDP_PAUSE_S: Final = 0.02
 _RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)
-_READ_BYTES: Final = 65536
-_UDP_BUFFER_BYTES: Final = 1 << 20
-_UDP_SLOTS: Final = 32
-_DATAGRAM_BYTES: Final = 65536
-"""The largest there is, so that none is cut."""
 
 COMPONENT: Final = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER, who we are on the link."""
@@ -57,144 +43,6 @@ _STREAMS: Final = (
     ("extra3_hz", dialect.MAV_DATA_STREAM_EXTRA3, dialect.MAVLINK_MSG_ID_SYSTEM_TIME),
 )
 """Option, stream, and the message by which its rate is judged."""
-
-Chunk = tuple[int, bytes]
-
-
-class Source(ABC):
-    """Where a link's bytes come from, and go to."""
-
-    pause_s: float
-
-    @abstractmethod
-    def fileno(self) -> int:
-        """What to wait on."""
-
-    @abstractmethod
-    def read(self) -> list[Chunk]:
-        """What has arrived, with receive times [ns of log time]; OSError when the device is gone."""
-
-    @abstractmethod
-    def write(self, data: bytes) -> None:
-        """Send if that is possible without waiting."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the device."""
-
-
-class SerialSource(Source):
-    """A serial device; one chunk is what one read gave.
-
-    Raises
-    ------
-    SourceError
-        It is not there, or is in use.
-    """
-
-    pause_s = _SERIAL_PAUSE_S
-
-    def __init__(self, device: str, baud: int, log_time: LogTime) -> None:
-        self._log_time = log_time
-        try:
-            self._port = serial.Serial(device, baud, timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:
-            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
-            raise SourceError(f"serial device {device} cannot be opened: {reason}") from None
-        os.set_blocking(self._port.fileno(), False)
-
-    def fileno(self) -> int:
-        """Descriptor of the device."""
-        return int(self._port.fileno())
-
-    def read(self) -> list[Chunk]:
-        """One chunk, or none."""
-        try:
-            data = os.read(self.fileno(), _READ_BYTES)
-        except BlockingIOError:
-            return []
-        if not data:
-            raise OSError("the device was unplugged")
-        return [(self._log_time.at(read_clocks()), data)]
-
-    def write(self, data: bytes) -> None:
-        """Send; what a full output buffer does not take is lost, as it would be on the air."""
-        with suppress(BlockingIOError):
-            os.write(self.fileno(), data)
-
-    def close(self) -> None:
-        """Close the device."""
-        with suppress(OSError):
-            self._port.close()
-
-
-class UdpSource(Source):
-    """A UDP port; one chunk is one datagram, stamped by the kernel. Answers go to the last sender.
-
-    Raises
-    ------
-    SourceError
-        The port is taken.
-    """
-
-    pause_s = _UDP_PAUSE_S
-
-    def __init__(self, address: str, port: int, log_time: LogTime) -> None:
-        self._socket = open_udp(address, port, _UDP_BUFFER_BYTES)
-        slots = np.zeros(_UDP_SLOTS, np.dtype((np.void, _DATAGRAM_BYTES)))
-        self._bytes = slots.view(np.uint8).reshape(_UDP_SLOTS, _DATAGRAM_BYTES)
-        self._receiver = Receiver(self._socket, slots, 0, _DATAGRAM_BYTES)
-        self._kernel_time = KernelTime(log_time, read_clocks())
-        self._peer: tuple[str, int] | None = None
-
-    @property
-    def drops(self) -> int:
-        """Datagrams the kernel dropped."""
-        return self._receiver.drops
-
-    def fileno(self) -> int:
-        """Descriptor of the socket."""
-        return self._socket.fileno()
-
-    def read(self) -> list[Chunk]:
-        """One chunk for each datagram."""
-        chunks: list[Chunk] = []
-        self._learn_peer()
-        count = _UDP_SLOTS
-        while count == _UDP_SLOTS:
-            count = self._receiver.receive()
-            now: Clocks = read_clocks()
-            stamps_ns = self._receiver.stamps_ns[:count]
-            stamps_ns[stamps_ns == 0] = now.realtime_ns
-            times_ns = self._kernel_time.convert(stamps_ns, now, emptied=count < _UDP_SLOTS).tolist()
-            sizes = self._receiver.sizes[:count].tolist()
-            chunks += [
-                (time_ns, self._bytes[i, :size].tobytes())
-                for i, (time_ns, size) in enumerate(zip(times_ns, sizes, strict=True))
-            ]
-        return chunks
-
-    def _learn_peer(self) -> None:
-        with suppress(OSError):
-            self._peer = self._socket.recvfrom(1, socket.MSG_PEEK)[1]
-
-    def write(self, data: bytes) -> None:
-        """Send to whoever was heard last."""
-        if self._peer is not None:
-            with suppress(OSError):
-                self._socket.sendto(data, self._peer)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-def open_source(config: LinkConfig, log_time: LogTime) -> Source:
-    """Open what a link's configuration names; SourceError if that is not possible."""
-    if config.serial:
-        assert config.device is not None
-        return SerialSource(config.device, config.baud, log_time)
-    return UdpSource(*config.udp_address(), log_time)
 
 
 @dataclass(slots=True)
