@@ -279,6 +279,21 @@ def test_the_start_of_a_log_may_die_and_the_rest_is_still_told_apart(log_file: P
     assert read(log_file)[0] == messages[6:]
 
 
+def test_a_wrong_topic_in_the_summary_or_the_metadata_is_not_believed(log_file: Path, messages: Read) -> None:
+    for finish in (True, False):
+        data = bytearray(written(messages, finish=finish))
+        offset, size = chunks_of(bytes(data))[0]
+        place = data.find(b"/mavlink/ins", offset + size) if finish else data.find(b"/mavlink/ins")
+        while place >= 0:  # in every copy but that of the first chunk, which is compressed
+            data[place + 9] ^= 0x01
+            place = data.find(b"/mavlink/ins", place)
+        data[offset : offset + size] = bytes(size)
+        log_file.write_bytes(data)
+        ours, log = read(log_file)
+        assert all(message in messages for message in ours)
+        assert log.damage
+
+
 def test_no_flipped_bit_goes_unnoticed_in_a_message_or_raises_but_a_log_error(log_file: Path) -> None:
     messages = messages_of(3)
     data = written(messages)

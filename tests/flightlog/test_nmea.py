@@ -93,6 +93,7 @@ def test_a_sentence_that_was_cut_gives_the_right_time_or_none(length: int) -> No
         "GPRMC,1200005,A,,,,,,,010120,,",
         "GPRMC,120000,A,,,,,,,300220,,",
         "GPRMC,120000,A,,,,,,,01012,,",
+        "GPRMC,120000,A,,,,,,,0101200,,",
         "GPRMC,,V,,,,,,,,,,N",
         "GPRMC,12 000,A,,,,,,,010120,,",
         "GPRMC",
