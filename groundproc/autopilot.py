@@ -178,7 +178,7 @@ def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> 
     if "time_boot_ms" in table.dtype.names:
         return np.asarray(table["time_boot_ms"].astype(np.int64) * NS_PER_MS + HALF_MS_NS)
     if "time_usec" in table.dtype.names:
-        clock_us = clock_ms * 1000
+        clock_us = clock_ms * 1000 + HALF_MS_NS // NS_PER_US
         usec = table["time_usec"].astype(np.int64)
         # ArduPilot of the 3.1 era sends a 32-bit count that wraps every 71.6 min
         wrapped = usec < 1 << 32

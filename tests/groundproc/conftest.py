@@ -4,9 +4,13 @@ import os
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from flightlog.mavlink import Frame
 
 
 @pytest.fixture(scope="session")
@@ -117,3 +121,35 @@ def monterey_log(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     words = ["import", "--pcap", str(recordings / "lidar/hdl32e_monterey.pcap"), "-o", str(path)]
     assert main([*words, "--mavlink", str(recordings / "mavlink/copter_flight_2015.tlog")]) == 0
     return path
+
+
+@pytest.fixture(scope="session")
+def tlog_frames(recordings: Path) -> Callable[[str], list["Frame"]]:
+    """Frames of a recorded telemetry log: each of its records is a big-endian time in microseconds and bytes."""
+    from flightlog.mavlink import FrameParser
+    from groundproc.importers import tlog
+
+    def read(name: str) -> list["Frame"]:
+        parser, found = FrameParser(), []
+        for record in tlog.records((recordings / "mavlink" / f"{name}.tlog").read_bytes(), tlog.TlogCount()):
+            found += parser.feed(record.time_ns, record.data)
+        return found + parser.finish()
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def frames_of() -> Callable[..., list["Frame"]]:
+    """Frames of pymavlink messages given with their receive times [ns]: frames_of([(time, message), ...], system=1, component=1)."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    from flightlog.mavlink import FrameParser
+
+    def make(messages: Sequence[tuple[int, object]], system: int = 1, component: int = 1) -> list["Frame"]:
+        sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+        parser, found = FrameParser(), []
+        for time_ns, message in messages:
+            found += parser.feed(time_ns, bytes(message.pack(sender)))  # type: ignore[attr-defined]
+        return found + parser.finish()
+
+    return make
