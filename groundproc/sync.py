@@ -27,6 +27,8 @@ GRID_HZ: Final = 100.0
 FINE_HZ: Final = 400.0
 """Rate at which the fast gyro is smoothed for the fit."""
 HIGH_PASS_HZ: Final = 0.2
+COARSE_HZ: Final = 10.0
+"""Low-pass of the fast gyro in the correlation."""
 CUTOFFS_HZ: Final = (3.0, 5.0, 8.0, 12.0, 20.0)
 """Low-pass of the fast gyro, tried in turn; the one that leaves the smallest residual is kept."""
 LEAST_MOTION_RAD_S: Final = np.deg2rad(1.0)
@@ -181,34 +183,31 @@ def synchronise(
 def _correlate(
     lidar: GyroTrack, ins: GyroTrack, mat_ins_lidar: Array | None, expected_ns: int | None, search_s: float
 ) -> _Peak:
-    cutoff = min(8.0, 0.45 * ins.rate_hz)
-    lidar_start, a = _on_grid(lidar, cutoff)
-    ins_start, b = _on_grid(ins, cutoff)
-    for track, grid in ((lidar, a), (ins, b)):
-        rms = float(np.sqrt((grid**2).sum(axis=1).mean()))
-        if rms < LEAST_MOTION_RAD_S:
-            raise SyncError(
-                f"gyro of {track.name}: {np.rad2deg(rms):.2f} deg/s rms above {HIGH_PASS_HZ} Hz, expected at least "
-                f"{np.rad2deg(LEAST_MOTION_RAD_S):.1f}; there is no motion to correlate"
-            )
-    cross, energy, overlap = _cross_correlation(a, b)
+    """Try every shift: the lidar's rates on the grid against the INS samples where they are, so that a slow gyro does not alias."""
+    a, a_heard = _on_grid(lidar)
+    b, b_heard = _samples_on_grid(ins)
+    for track, grid, heard in ((lidar, a, a_heard), (ins, b, b_heard)):
+        _check_motion(track, grid, heard)
     # lag k of the arrays: b[i + k] goes with a[i]
+    cross = _lagged(a, b)
+    energy_a = _lagged((a**2).sum(axis=1, keepdims=True), b_heard[:, None])[:, 0, 0]
+    energy_b = _lagged(a_heard[:, None], (b**2).sum(axis=1, keepdims=True))[:, 0, 0]
+    common = np.rint(_lagged(a_heard[:, None], b_heard[:, None])[:, 0, 0])
     lags = np.arange(-(len(a) - 1), len(b))
-    step_ns = round(NS_PER_S / GRID_HZ)
-    offsets = ins_start - lidar_start + lags * step_ns
-    usable = overlap >= min(LEAST_OVERLAP_S * GRID_HZ, 0.9 * min(len(a), len(b)))
+    offsets = int(ins.time_ns[0] - lidar.time_ns[0]) + lags * round(NS_PER_S / GRID_HZ)
+    usable = common >= min(LEAST_OVERLAP_S * ins.rate_hz, 0.9 * b_heard.sum())
     if expected_ns is not None:
         usable &= np.abs(offsets - expected_ns) <= search_s * NS_PER_S
     if not usable.any():
         where = "" if expected_ns is None else f" within {search_s:.0f} s of what the receive times say"
         raise SyncError(f"gyros of {lidar.name} and {ins.name}: no shift{where} overlaps by {LEAST_OVERLAP_S:.0f} s")
-    cross, energy, offsets, overlap = cross[usable], energy[usable], offsets[usable], overlap[usable]
-    singular = np.linalg.svd(cross, compute_uv=False)
-    score = singular.sum(axis=1) / np.maximum(energy, 1e-3 * energy.max())
+    cross, offsets, common = cross[usable], offsets[usable], common[usable]
+    norm = np.sqrt(np.maximum(energy_a[usable], 0.0) * np.maximum(energy_b[usable], 0.0))
+    score = np.linalg.svd(cross, compute_uv=False).sum(axis=1) / np.maximum(norm, 1e-3 * norm.max())
     best = int(np.argmax(score))
     away = np.abs(offsets - offsets[best]) > NS_PER_S
     rival = float(score[away].max()) if away.any() else 0.0
-    independent = overlap[best] / GRID_HZ * 2 * MOTION_HZ
+    independent = common[best] * min(1.0, 2.0 * MOTION_HZ / ins.rate_hz)
     odds = 0.5 * independent * np.log((1 - min(rival, 1.0) ** 2 + 1e-9) / (1 - min(score[best], 1.0) ** 2 + 1e-9))
     return _Peak(
         int(offsets[best]),
@@ -220,46 +219,62 @@ def _correlate(
     )
 
 
-def _on_grid(track: GyroTrack, cutoff_hz: float) -> tuple[int, Array]:
-    """Band-passed rates on the 100 Hz grid, and the time of its first point; silences are zero."""
-    start = int(track.time_ns[0])
-    seconds = (track.time_ns - start) * 1e-9
+def _seconds(track: GyroTrack) -> Array:
+    seconds = np.asarray((track.time_ns - track.time_ns[:1]) * 1e-9, np.float64)
     if len(seconds) < 8 or seconds[-1] < LEAST_OVERLAP_S:
         raise SyncError(
             f"gyro of {track.name}: {len(seconds)} samples in {seconds[-1] if len(seconds) else 0:.1f} s, "
             f"expected at least {LEAST_OVERLAP_S:.0f} s"
         )
+    return seconds
+
+
+def _on_grid(track: GyroTrack) -> tuple[Array, Array]:
+    """Band-passed rates of the fast gyro on the grid, shape (n, 3), and where it was heard, shape (n,); silences are zero."""
+    seconds = _seconds(track)
     grid = np.arange(0.0, seconds[-1], 1.0 / GRID_HZ)
-    fast = track.rate_hz > 2 * GRID_HZ
-    interpolant = None if fast else CubicSpline(seconds, track.rate_rad_s, axis=0)
-    values = _smooth(track, cutoff_hz, grid) if interpolant is None else interpolant(grid)
+    values = np.stack([np.interp(grid, seconds, axis) for axis in track.rate_rad_s.T], axis=1)
     before = np.clip(np.searchsorted(seconds, grid, side="right") - 1, 0, len(seconds) - 2)
-    gap = np.maximum(1.0, 6.0 / max(track.rate_hz, 0.1))
-    silent = seconds[before + 1] - seconds[before] > gap
-    values[silent] = np.median(track.rate_rad_s, axis=0)
+    heard = seconds[before + 1] - seconds[before] <= max(1.0, 6.0 / max(track.rate_hz, 0.1))
+    values[~heard] = np.median(track.rate_rad_s, axis=0)
     # Gaussian filters: no delay, no ringing, and a median first, so that huge offsets leave no steps at the ends
-    values = _low_pass(values - np.median(values, axis=0), cutoff_hz, GRID_HZ)
+    values = _low_pass(values - np.median(values, axis=0), COARSE_HZ, GRID_HZ)
     values = values - _low_pass(values, HIGH_PASS_HZ, GRID_HZ)
-    values[silent] = 0.0
-    return start, values
+    values[~heard] = 0.0
+    return values, heard.astype(np.float64)
 
 
-def _cross_correlation(a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Sums over i of b[i + k] a[i]^T, shape (lags, 3, 3), the norms they could reach, and the number of terms."""
+def _samples_on_grid(track: GyroTrack) -> tuple[Array, Array]:
+    """High-passed samples of the slow gyro at the nearest points of the grid, shape (n, 3), and where they are, shape (n,)."""
+    place = np.rint(_seconds(track) * GRID_HZ).astype(np.int64)
+    count = np.bincount(place).astype(np.float64)
+    centred = track.rate_rad_s - np.median(track.rate_rad_s, axis=0)
+    values = np.stack([np.bincount(place, axis) for axis in centred.T], axis=1) / np.maximum(count, 1.0)[:, None]
+    heard = (count > 0).astype(np.float64)
+    slow = _low_pass(values, HIGH_PASS_HZ, GRID_HZ) / np.maximum(_low_pass(heard, HIGH_PASS_HZ, GRID_HZ), 1e-6)[:, None]
+    return (values - slow) * heard[:, None], heard
+
+
+def _check_motion(track: GyroTrack, grid: Array, heard: Array) -> None:
+    """Refuse a gyro that did not move in any stretch of `LEAST_OVERLAP_S`."""
+    block = np.arange(len(grid)) // int(LEAST_OVERLAP_S * GRID_HZ)
+    power = np.bincount(block, (grid**2).sum(axis=1))
+    present = np.bincount(block, heard)
+    full = present >= 0.5 * present.max()
+    rms = float(np.sqrt((power[full] / present[full]).max()))
+    if rms < LEAST_MOTION_RAD_S:
+        raise SyncError(
+            f"gyro of {track.name}: {np.rad2deg(rms):.2f} deg/s rms above {HIGH_PASS_HZ} Hz, expected at least "
+            f"{np.rad2deg(LEAST_MOTION_RAD_S):.1f}; there is no motion to correlate"
+        )
+
+
+def _lagged(a: Array, b: Array) -> Array:
+    """Sums over i of b[i + k] a[i]^T for all lags k from 1 - len(a) to len(b) - 1, shape (lags, columns of b, columns of a)."""
     size = fft.next_fast_len(len(a) + len(b) - 1, real=True)
     order = np.concatenate([np.arange(size - len(a) + 1, size), np.arange(len(b))])
-
-    def correlate(x: Array, y: Array) -> Array:
-        spectrum = np.conj(fft.rfft(x, size, axis=0))[:, None, :] * fft.rfft(y, size, axis=0)[:, :, None]
-        return np.asarray(fft.irfft(spectrum, size, axis=0)[order])
-
-    ones_a, ones_b = np.ones((len(a), 1)), np.ones((len(b), 1))
-    energy_a = correlate((a**2).sum(axis=1, keepdims=True), ones_b)[:, 0, 0]
-    energy_b = correlate(ones_a, (b**2).sum(axis=1, keepdims=True))[:, 0, 0]
-    norm = np.sqrt(np.maximum(energy_a, 0.0) * np.maximum(energy_b, 0.0))
-    lags = np.arange(-(len(a) - 1), len(b))
-    overlap = np.minimum(len(a), len(b) - lags) - np.maximum(0, -lags)
-    return correlate(a, b), norm, overlap
+    spectrum = np.conj(fft.rfft(a, size, axis=0))[:, None, :] * fft.rfft(b, size, axis=0)[:, :, None]
+    return np.asarray(fft.irfft(spectrum, size, axis=0)[order])
 
 
 def _rotation(cross: Array, mat_ins_lidar: Array | None) -> Array:
@@ -273,11 +288,6 @@ def _rotation(cross: Array, mat_ins_lidar: Array | None) -> Array:
     if mat_ins_lidar is not None:
         return mat_ins_lidar
     return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
-
-
-def _smooth(track: GyroTrack, cutoff_hz: float, at_s: Array) -> Array:
-    """Rates of a fast gyro, low-passed without delay (Gaussian), at times in seconds from its first sample."""
-    return np.asarray(_smooth_spline(track, cutoff_hz)(at_s))
 
 
 def _smooth_spline(track: GyroTrack, cutoff_hz: float) -> CubicSpline:

@@ -149,7 +149,7 @@ def _undulation(boot: Boot) -> float:
             return float(np.median(table["alt_ellipsoid"][both].astype(np.int64) - table["alt"][both]) * 1e-3)
     raise LogError(
         "heights above the ellipsoid: the autopilot states none (GPS_RAW_INT.alt_ellipsoid) and no undulation of the geoid is given; "
-        "give it with --undulation"
+        "give it with --geoid"
     )
 
 
