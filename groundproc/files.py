@@ -28,6 +28,26 @@ def written_aside(path: Path) -> Iterator[Path]:
             aside.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def made_folder(path: Path) -> Iterator[None]:
+    """Make a folder for what is written inside; one that was not there before goes again if nothing came of it.
+
+    Raises
+    ------
+    SourceError
+        It cannot be made or written to.
+    """
+    was_there = path.is_dir()
+    make_folder(path)
+    try:
+        yield
+    except BaseException:
+        if not was_there:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+        raise
+
+
 def make_folder(path: Path) -> None:
     """Make a folder with its parents and see that it can be written to.
 

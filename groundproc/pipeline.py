@@ -23,7 +23,7 @@ from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc import decode, geodesy, georeference, load, sensor_model
 from groundproc.decode import Gate
-from groundproc.files import make_folder, written_aside
+from groundproc.files import made_folder, written_aside
 from groundproc.flight import Flight, read_flight
 from groundproc.georeference import Dropped, Points
 from groundproc.mounting import find_mount
@@ -79,8 +79,10 @@ def process(
     dict
         What quality.json holds.
     """
-    make_folder(folder)
+    if survey.epsg is not None:
+        geodesy.projected_crs(survey.epsg)  # a wrong code is said before the work, not after
     with contextlib.ExitStack() as stack:
+        stack.enter_context(made_folder(folder))
         readers = [stack.enter_context(LogReader(path)) for path in logs]
         check_order(readers)
         mount, mount_source = find_mount(survey.mount, readers)
@@ -111,13 +113,11 @@ def check_order(readers: list[LogReader]) -> None:
 
 def fly(timeline: Sequence[Leg], survey: Survey, mount: Mount) -> Trajectory:
     """The trajectory of all legs, in the local frame of the first fix."""
-    fixes = [ins.position_fixes(leg.boot, survey.height, None) for leg in timeline] if survey.geoid is None else None
-    if fixes is None:
-        plain = [ins.position_fixes(leg.boot, "msl") for leg in timeline]
-        undulation_m = geodesy.undulation(
-            survey.geoid or "", float(plain[0].latitude_deg[0]), float(plain[0].longitude_deg[0])
-        )
-        fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in timeline]
+    undulation_m = None
+    if survey.geoid is not None:
+        place = ins.position_fixes(timeline[0].boot, "msl")
+        undulation_m = geodesy.undulation(survey.geoid, float(place.latitude_deg[0]), float(place.longitude_deg[0]))
+    fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in timeline]
     first = fixes[0]
     frame = geodesy.LocalFrame(float(first.latitude_deg[0]), float(first.longitude_deg[0]), float(first.height_m[0]))
     grid_ns = None if survey.pose_grid_ms is None else round(survey.pose_grid_ms * 1e6)
