@@ -120,7 +120,9 @@ def _convert(value: Any, hint: Any, rules: Mapping[str, Any], place: str) -> Any
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in typing.get_args(hint):
             return None
-        hint = next(arm for arm in typing.get_args(hint) if arm is not type(None))
+        arms = [arm for arm in typing.get_args(hint) if arm is not type(None)]
+        # of several, a text is taken as a text, all else as what stands first
+        hint = str if str in arms and isinstance(value, str) else arms[0]
         return _convert(value, hint, rules, place)
     if dataclasses.is_dataclass(hint):
         return from_mapping(value, typing.cast(type, hint), place)

@@ -76,14 +76,18 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     return (32600 if latitude_deg >= 0 else 32700) + zone
 
 
-def projected_crs(epsg: int) -> pyproj.CRS:
-    """The CRS of an EPSG code.
+def projected_crs(code: int | str) -> pyproj.CRS:
+    """The CRS of an EPSG code, such as 32633 or "EPSG:32633".
 
     Raises
     ------
     GeodesyError
         Unknown code, or not a horizontal projected CRS in metres.
     """
+    text = str(code).upper().removeprefix("EPSG:").strip()
+    if not text.isdigit():
+        raise GeodesyError(f"CRS {code!r}: expected an EPSG code such as 32633 or EPSG:32633")
+    epsg = int(text)
     try:
         crs = pyproj.CRS.from_epsg(epsg)
     except CRSError:
@@ -102,7 +106,7 @@ def with_sea_level(crs: pyproj.CRS) -> pyproj.CRS:
     return pyproj.CRS.from_user_input(f"EPSG:{crs.to_epsg()}+5773")
 
 
-def undulation(geoid: str, latitude_deg: float, longitude_deg: float) -> float:
+def undulation(geoid: float | str, latitude_deg: float, longitude_deg: float) -> float:
     """Height of the geoid above the ellipsoid at a place [m].
 
     Parameters
@@ -119,7 +123,7 @@ def undulation(geoid: str, latitude_deg: float, longitude_deg: float) -> float:
     try:
         value = float(geoid)
     except ValueError:
-        return _grid_undulation(Path(geoid), latitude_deg, longitude_deg)
+        return _grid_undulation(Path(str(geoid)), latitude_deg, longitude_deg)
     if not abs(value) <= LARGEST_UNDULATION_M:
         raise GeodesyError(
             f"geoid {geoid} m: the geoid lies within {LARGEST_UNDULATION_M:.0f} m of the ellipsoid everywhere"

@@ -5,12 +5,12 @@ from importlib import resources
 
 from flightlog.errors import ConfigError
 from flightlog.logfile import LogReader
-from flightlog.mount import Mount, parse_mount
+from flightlog.mount import Mount, load_mount, parse_mount
 
 ATTACHMENT = "mount.yaml"
 
 
-def find_mount(chosen: Mount | None, readers: Sequence[LogReader]) -> tuple[Mount, str]:
+def find_mount(chosen: Mount | str | None, readers: Sequence[LogReader]) -> tuple[Mount, str]:
     """The mount, and where it comes from.
 
     Raises
@@ -18,6 +18,8 @@ def find_mount(chosen: Mount | None, readers: Sequence[LogReader]) -> tuple[Moun
     ConfigError
         The logs hold different mounts, or one that cannot be read.
     """
+    if isinstance(chosen, str):
+        return load_mount(chosen), chosen
     if chosen is not None:
         return chosen, "survey"
     found = {

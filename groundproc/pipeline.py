@@ -79,8 +79,8 @@ def process(
     dict
         What quality.json holds.
     """
-    if survey.epsg is not None:
-        geodesy.projected_crs(survey.epsg)  # a wrong code is said before the work, not after
+    if survey.crs is not None:
+        geodesy.projected_crs(survey.crs)  # a wrong code is said before the work, not after
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder))
         readers = [stack.enter_context(LogReader(path)) for path in logs]
@@ -90,8 +90,8 @@ def process(
         timeline = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), survey.sync)
         trajectory = fly(timeline, survey, mount) if poses is None else read_trajectory(poses)
         frame = trajectory.frame
-        epsg = survey.epsg or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
-        projection = geodesy.Projection(frame, geodesy.projected_crs(epsg))
+        code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
+        projection = geodesy.Projection(frame, geodesy.projected_crs(code))
         tally, sample = write_cloud(readers, timeline, trajectory, mount, survey, projection, folder, progress)
         write_trajectory(folder / "trajectory.csv", trajectory)
         draw_cloud(folder, sample, projection.crs.name)

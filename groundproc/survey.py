@@ -10,20 +10,19 @@ from flightlog.mount import Mount
 class Survey:
     """The options of `swath process`; on the command line they have the same names."""
 
-    mount: Mount | None = option(
-        None, "how the lidar sits on the airframe (lidar: position_m, yaw_deg, ...); null: as the log has it"
-    )
-    epsg: int | None = option(
+    mount: Mount | str | None = option(
         None,
-        "EPSG code of the output, projected and in metres; null: UTM zone of the first fix",
-        minimum=1024,
-        maximum=32767,
+        "how the lidar sits on the airframe: a mount file, looked for beside this one, or what stands in it "
+        "(lidar: position_m, yaw_deg, ...); null: as the log has it",
+    )
+    crs: int | str | None = option(
+        None, "EPSG code of the output (32633 or EPSG:32633), projected and in metres; null: UTM zone of the first fix"
     )
     height: str = option("msl", "what heights refer to", choices=("msl", "ellipsoid", "relative"))
-    geoid: str | None = option(
+    geoid: float | str | None = option(
         None,
         "for height: ellipsoid where the autopilot does not state both heights: the geoid's height above the ellipsoid "
-        "there [m] as a number, or a grid file that PROJ reads (.gtx, .tif)",
+        "there [m], or a grid file that PROJ reads (.gtx, .tif)",
     )
     method: str = option("ins", "how the trajectory is made", choices=("ins",))
     pose_grid_ms: float | None = option(

@@ -19,7 +19,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
     parser.add_argument("--method", choices=("ins",), help="how the trajectory is made")
-    parser.add_argument("--epsg", type=int, help="output CRS; default: UTM zone of the first fix")
+    parser.add_argument(
+        "--crs",
+        "--epsg",
+        metavar="EPSG",
+        help="output CRS, such as 32633 or EPSG:32633; default: UTM zone of the first fix",
+    )
     parser.add_argument(
         "--height", choices=("msl", "ellipsoid", "relative"), help="what heights refer to; default: msl"
     )
@@ -55,20 +60,21 @@ def run(arguments: argparse.Namespace) -> int:
 def _survey(arguments: argparse.Namespace) -> Survey:
     """The survey file with the command line's options laid over it."""
     from flightlog import config
-    from flightlog.mount import load_mount
     from groundproc.options import field_of_view, milliseconds
     from groundproc.survey import Survey
 
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())
+    if isinstance(tree["mount"], str):
+        tree["mount"] = str(arguments.config.parent / tree["mount"])
     given = {
-        "epsg": arguments.epsg,
+        "crs": arguments.crs,
         "method": arguments.method,
         "height": arguments.height,
         "geoid": arguments.geoid,
         "sync": arguments.sync,
         "pose_grid_ms": arguments.pose_grid and milliseconds(arguments.pose_grid),
         "fov_deg": arguments.fov and list(field_of_view(arguments.fov)),
-        "mount": arguments.mount and config.to_mapping(load_mount(arguments.mount)),
+        "mount": arguments.mount and str(arguments.mount),
     }
     return config.from_mapping(tree | {k: v for k, v in given.items() if v is not None}, Survey, "command line")
 

@@ -12,7 +12,7 @@ Array = npt.NDArray[np.float64]
 
 LARGEST_SAMPLE: Final = 500_000
 """Points kept for the pictures, however long the flight."""
-PIXELS: Final = 900
+PIXELS: Final = 600
 
 
 class CloudSample:

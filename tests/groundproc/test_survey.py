@@ -34,7 +34,7 @@ def test_every_option_can_be_set(tmp_path: Path) -> None:
         tmp_path,
         """
         mount: {lidar: {position_m: [0.01, 0.02, -0.2], pitch_deg: -30}, gps_position_m: [0, -0.1, 0.2]}
-        epsg: 3006
+        crs: 3006
         height: ellipsoid
         geoid: "29.35"
         method: ins
@@ -45,10 +45,10 @@ def test_every_option_can_be_set(tmp_path: Path) -> None:
         max_range_m: 50
         """,
     )
-    assert chosen.mount is not None
+    assert isinstance(chosen.mount, Mount)
     assert chosen.mount.lidar.position_m == (0.01, 0.02, -0.2)
     assert chosen.mount.lidar.roll_deg == 0.0
-    assert (chosen.epsg, chosen.height, chosen.geoid, chosen.pose_grid_ms) == (3006, "ellipsoid", "29.35", 10.0)
+    assert (chosen.crs, chosen.height, chosen.geoid, chosen.pose_grid_ms) == (3006, "ellipsoid", "29.35", 10.0)
     assert (chosen.sync, chosen.fov_deg, chosen.min_range_m, chosen.max_range_m) == ("host", (0.0, 360.0), 2.0, 50.0)
     assert config.loads(config.dump(chosen), Survey, "again") == chosen
 
@@ -56,8 +56,8 @@ def test_every_option_can_be_set(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "colour: red", "height: sea", "method: magic", "epsg: ten", "epsg: 1", "pose_grid_ms: 0", "fov_deg: [1]", "fov_deg: 255-105",
-        "min_range_m: -1", "max_range_m: 500", "sync: maybe", "mount: {lidar: {tilt: 3}}", "mount: here.yaml",
+        "colour: red", "height: sea", "method: magic", "crs: [1]", "pose_grid_ms: 0", "fov_deg: [1]", "fov_deg: 255-105",
+        "min_range_m: -1", "max_range_m: 500", "sync: maybe", "mount: {lidar: {tilt: 3}}",
         "{min_range_m: 60, max_range_m: 50}", "- a\n- b", "geoid: [1]",
     ],
 )  # fmt: skip
@@ -109,3 +109,15 @@ def test_a_mount_in_the_log_that_cannot_be_read_is_refused_by_name(tmp_path: Pat
         pytest.raises(ConfigError, match=r"a\.mcap: mount\.yaml"),
     ):
         find_mount(None, [a])
+
+
+def test_a_mount_file_named_in_the_survey_is_read_from_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("lidar: {pitch_deg: -33}")
+    mount, source = find_mount(str(tmp_path / "mine.yaml"), [])
+    assert mount.lidar.pitch_deg == -33.0
+    assert source.endswith("mine.yaml")
+
+
+def test_a_mount_file_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nowhere"):
+        find_mount(str(tmp_path / "nowhere.yaml"), [])
