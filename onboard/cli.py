@@ -10,6 +10,7 @@ from pathlib import Path
 
 from flightlog import __version__
 from flightlog.errors import SwathError
+from onboard.commands import lidar
 
 _CONFIG = Path("/etc/swathd/swathd.yaml")
 
@@ -40,6 +41,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_config(health)
     health.add_argument("--json", action="store_true", help="the whole status, with the verdict")
     health.set_defaults(command=_health)
+
+    for command in (lidar,):
+        name = command.__name__.rpartition(".")[2]
+        child = commands.add_parser(name, help=command.HELP, description=command.HELP)
+        command.add_arguments(child)
+        child.set_defaults(command=command.run)
     return parser
 
 
