@@ -44,7 +44,7 @@ BIAS_KNOT_S: Final = 30.0
 """Spacing of the linear spline that takes up both gyros' biases and their drift."""
 DRIFT_PRIOR_PPM: Final = 60.0
 """Standard deviation of the drift between two crystals before the data speak; the lidar's alone is some 58 ppm."""
-ROTATION_PRIOR_RAD: Final = 0.3
+ROTATION_PRIOR_RAD: Final = 0.05
 BLOCK_S: Final = 2.0
 """Residuals further apart than this are taken to be independent in the stated sigma."""
 
@@ -320,7 +320,7 @@ def _fit(lidar: GyroTrack, ins: GyroTrack, peak: _Peak, cutoff_hz: float, mat_mo
         raise SyncError(f"gyros of {lidar.name} and {ins.name}: {len(time_s)} common samples, expected at least 30")
     mid_s = 0.5 * (time_s[0] + time_s[-1])
     unbias = _bias_projector(time_s)
-    rotation, shift = peak.mat_ins_lidar, np.zeros(2)  # offset [s], drift
+    rotation, shift, turned_by = peak.mat_ins_lidar, np.zeros(2), np.zeros(3)  # shift: offset [s], drift
     # the prior on the rotation keeps an axis that hardly moved where the correlation, or the mount, put it
     prior = np.array([0.0, (DRIFT_PRIOR_PPM * 1e-6) ** -2, *[ROTATION_PRIOR_RAD**-2] * 3])
     for _ in range(20):
@@ -333,8 +333,9 @@ def _fit(lidar: GyroTrack, ins: GyroTrack, peak: _Peak, cutoff_hz: float, mat_mo
         weight = _weights(residual)
         normal = np.einsum("nki,nk,nkj->ij", jacobian, weight, jacobian) + np.diag(prior)
         score = np.einsum("nki,nk,nk->i", jacobian, weight, residual)
-        step = np.linalg.solve(normal, score - prior * np.array([0.0, shift[1], 0.0, 0.0, 0.0]))
+        step = np.linalg.solve(normal, score - prior * np.array([0.0, shift[1], *turned_by]))
         shift = shift + step[:2]
+        turned_by = turned_by + step[2:]
         rotation = mat_from_quat(quat_exp(step[2:])) @ rotation
         if abs(step[0]) < 1e-7 and np.abs(step[2:]).max() < 1e-6:
             break
