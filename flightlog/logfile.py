@@ -1,7 +1,7 @@
 """A flight log on disk: LogWriter, and LogReader, which also reads what a power cut left.
 
-The container is MCAP (mcap.dev/spec). Writing is the mcap library's; reading is ours because the library gives up at the first
-damaged byte, and a log from a crash is the one that matters most.
+The container is MCAP (mcap.dev/spec). Its bytes are in `mcapwriter`, `container` and `walk`: a library's reader gives up at the
+first damaged byte, its writer at a full disk, and a log from a bad day is the one that matters most.
 """
 
 import json
@@ -13,11 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, NamedTuple, Self
 
-from mcap.writer import CompressionType, Writer
-
 from flightlog import container
 from flightlog.container import DAMAGE, MAGIC, RECORD_HEAD, Opcode
 from flightlog.errors import LogError
+from flightlog.mcapwriter import McapWriter
 from flightlog.records import FORMAT_VERSION, record_type
 from flightlog.walk import ChunkAt, Hole, Walk
 
@@ -57,6 +56,8 @@ class LogWriter:
         Uncompressed size at which a chunk is closed.
     library : str
         Name and version of the writing program.
+    compression : {"zstd", "lz4", "none"}
+        Of the chunks.
     """
 
     def __init__(
@@ -67,18 +68,33 @@ class LogWriter:
         attachments: Mapping[str, bytes],
         chunk_bytes: int = 1 << 20,
         library: str = "swath",
+        compression: str = "zstd",
     ) -> None:
-        self._writer = Writer(stream, chunk_size=chunk_bytes, compression=CompressionType.ZSTD, enable_data_crcs=False)
-        self._writer.start(profile="ros2", library=library)
+        self._stream = stream
+        self._writer = McapWriter(stream, "ros2", library, chunk_bytes, compression)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._sequence: dict[int, int] = {}
         self._flushes = 0
         self.add_metadata("swath.log", {"format_version": str(FORMAT_VERSION)})
         for name, values in metadata.items():
             self.add_metadata(name, values)
         for name, content in attachments.items():
-            self._writer.add_attachment(0, 0, name, _media_type(name), content)
+            self._writer.add_attachment(name, _media_type(name), content)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages that are in the file, by topic; what waits in the open chunk is not."""
+        return {topic: self._writer.counts.get(number, 0) for topic, number in self._channels.items()}
+
+    @property
+    def lost(self) -> int:
+        """Messages of chunks that the stream did not take."""
+        return self._writer.lost
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Log time of the first and the last message in the file [ns]; zeros where there is none."""
+        return self._writer.start_ns, self._writer.end_ns
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record now."""
@@ -92,19 +108,16 @@ class LogWriter:
         if row is None:
             raise LogError(f"topic {topic!r} is not in the table of records")
         if row.schema not in self._schemas:
-            self._schemas[row.schema] = self._writer.register_schema(row.schema, "ros2msg", row.definition.encode())
-        self._channels[topic] = self._writer.register_channel(
+            self._schemas[row.schema] = self._writer.add_schema(row.schema, "ros2msg", row.definition.encode())
+        self._channels[topic] = self._writer.add_channel(
             topic, "cdr", self._schemas[row.schema], {"offered_qos_profiles": _QOS}
         )
-        self._sequence[self._channels[topic]] = 0
 
     def write(self, topic: str, log_time_ns: int, data: bytes) -> None:
         """Append one message; `data` is what an encode function of `records` made."""
         if topic not in self._channels:
             self.add_topic(topic)
-        channel = self._channels[topic]
-        self._sequence[channel] += 1
-        self._writer.add_message(channel, log_time_ns, data, log_time_ns, self._sequence[channel])
+        self._writer.add_message(self._channels[topic], log_time_ns, data)
 
     def flush(self) -> None:
         """Close the open chunk and hand everything to the stream, which is flushed too. Syncing to the disk is the caller's.
@@ -116,11 +129,12 @@ class LogWriter:
         if self._channels and self._flushes & (self._flushes - 1) == 0:
             topics = {str(number): topic for topic, number in self._channels.items()}
             self.add_metadata(_TOPICS, topics | {_CHECK: _check_value(topics)})
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.close_chunk()
+        self._stream.flush()
 
     def finish(self) -> None:
         """Write summary and footer. The stream stays open."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()
 
 
 def _check_value(topics: Mapping[str, str]) -> str:

@@ -184,10 +184,12 @@ def set_receive_time_ns(packets: npt.NDArray[np.void], time_ns: npt.NDArray[np.i
 
 def encode_scan(stamp_ns: int, packets: npt.NDArray[np.void], frame_id: str = "velodyne") -> bytes:
     """Encode packets of SCAN_PACKET_DTYPE, shape (n,), as a VelodyneScan."""
-    body = packets.tobytes()
-    if len(packets):  # the last element carries no padding
-        body = body[: _SCAN_PACKET_BYTES - SCAN_PACKET_DTYPE.itemsize]
-    return _header(stamp_ns, frame_id) + struct.pack("<I", len(packets)) + body
+    head = _header(stamp_ns, frame_id) + struct.pack("<I", len(packets))
+    if not len(packets):
+        return head
+    body = np.ascontiguousarray(packets).view(np.uint8).data
+    # The last element carries no padding. One copy, and no more, leaves the array.
+    return b"".join((head, body[: _SCAN_PACKET_BYTES - SCAN_PACKET_DTYPE.itemsize]))
 
 
 def decode_scan(data: bytes | memoryview) -> npt.NDArray[np.void]:
