@@ -44,8 +44,8 @@ class HostLine:
 
     def device_ns(self, host_ns: int) -> int:
         """Device time [ns] of what is received at a time [ns] without delay."""
-        device_ns = host_ns - self.offset_ns
-        return device_ns - round((device_ns - self.reference_ns) * self.drift_ppm * 1e-6)
+        since_ns = host_ns - self.offset_ns - self.reference_ns
+        return self.reference_ns + round(since_ns / (1.0 + self.drift_ppm * 1e-6))
 
 
 def host_line(device_ns: npt.NDArray[np.int64], host_ns: npt.NDArray[np.int64]) -> HostLine:
