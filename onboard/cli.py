@@ -10,9 +10,10 @@ from pathlib import Path
 
 from flightlog import __version__
 from flightlog.errors import SwathError
-from onboard.commands import lidar
+from onboard.commands import gate, install, lidar, uninstall
 
 _CONFIG = Path("/etc/swathd/swathd.yaml")
+_RUNTIME = Path("/run/swathd")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     health.add_argument("--json", action="store_true", help="the whole status, with the verdict")
     health.set_defaults(command=_health)
 
-    for command in (lidar,):
+    for command in (lidar, install, uninstall, gate):
         name = command.__name__.rpartition(".")[2]
         child = commands.add_parser(name, help=command.HELP, description=command.HELP)
         command.add_arguments(child)
@@ -80,7 +81,9 @@ def _health(options: argparse.Namespace) -> int:
 
     from onboard import config, health
 
-    path = config.load(options.config).status_path(os.environ.get("RUNTIME_DIRECTORY"))
+    # the configuration of the installed service goes with the service's own folder
+    folder = str(_RUNTIME) if options.config == _CONFIG and _RUNTIME.is_dir() else None
+    path = config.load(options.config).status_path(os.environ.get("RUNTIME_DIRECTORY", folder))
     try:
         text = path.read_text(encoding="utf-8")
         status = health.from_json(text, str(path))
@@ -90,9 +93,15 @@ def _health(options: argparse.Namespace) -> int:
         print(f"{health.Level.CRITICAL.name}: {reason}")
         return int(health.Level.CRITICAL)
     boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    verdict = health.judge(status, time.monotonic_ns(), boot_id)
+    now_ns = time.monotonic_ns()
+    verdict = health.judge(status, now_ns, boot_id)
     if options.json:
-        tree = {"verdict": verdict.level.name, "findings": verdict.findings, "status": json.loads(text)}
+        tree = {
+            "verdict": verdict.level.name,
+            "findings": verdict.findings,
+            "armed": health.armed(status, now_ns, boot_id),
+            "status": json.loads(text),
+        }
         print(json.dumps(tree, indent=1))
     else:
         print("\n".join(health.report(status, verdict)))

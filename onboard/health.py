@@ -157,6 +157,22 @@ def judge(status: Status, now_ns: int, boot_id: str) -> Verdict:
     return Verdict(max((level for level, _ in found), default=Level.GOOD), [text for _, text in found])
 
 
+def armed(status: Status, now_ns: int, boot_id: str) -> bool | None:
+    """Whether the aircraft is armed, by any of its autopilots; None where that is not known now.
+
+    Known is what an autopilot said that is still heard, in a status that is not stale.
+    """
+    if status.boot_id != boot_id or now_ns - status.time_ns > STALE_S * NS_PER_S:
+        return None
+    heard = [
+        link.armed if link.connected and link.age_s is not None and link.age_s <= LINK_SILENT_S else None
+        for link in status.links.values()
+    ]
+    if True in heard:
+        return True
+    return None if None in heard or not heard else False
+
+
 def _judge_lidar(lidar: LidarStatus) -> list[tuple[Level, str]]:
     found = []
     if lidar.age_s is None and lidar.rejected:

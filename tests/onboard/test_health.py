@@ -89,3 +89,22 @@ def test_the_report_has_the_verdict_first() -> None:
     lines = health.report(GOOD, health.judge(GOOD, 101 * S, "b"))
     assert lines[0].startswith("GOOD: 00001-000.mcap: lidar 1808/s")
     assert len(lines) == 4
+
+
+def test_armed_is_known_only_of_an_autopilot_that_is_heard_now() -> None:
+    def of(*links: LinkStatus, age_s: float = 0.0, boot: str = "b") -> bool | None:
+        named = {str(i): link for i, link in enumerate(links)}
+        status = Status(0, "b", "", 1, 1.0, 0, LidarStatus(), named, RecorderStatus())
+        return health.armed(status, int(age_s * 1e9), boot)
+
+    yes, no, unsaid = (LinkStatus(connected=True, age_s=0.5, armed=one) for one in (True, False, None))
+    assert of(no) is False
+    assert of(no, no) is False
+    assert of(no, yes) is True
+    assert of(unsaid, yes) is True
+    assert of(no, unsaid) is None
+    assert of() is None
+    assert of(replace(no, age_s=10.0)) is None
+    assert of(replace(yes, connected=False)) is None
+    assert of(no, age_s=10.0) is None
+    assert of(no, boot="another") is None
