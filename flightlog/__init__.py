@@ -30,6 +30,7 @@ clock, nmea                   time scales and how stamps unwrap; GPRMC
 frames, mount                 rotations; where lidar and antennas sit on the airframe
 hdl32e, mavlink, dataflash    the sensors' wire formats
 records, logfile              THE table of topics and their bytes; writer and reader of the log
+salvage                       a whole log out of a cut or damaged one
 container, mcapwriter, walk   the records of an MCAP file; writing them; the way through a damaged one
 """
 

@@ -158,10 +158,16 @@ class Damage:
     """Bytes of the file in bad chunks, skipped stretches and the torn tail."""
     places: list[str] = field(default_factory=list)
     """One phrase for each place, the first twenty."""
+    count: int = 0
+    """Damaged places."""
+    reaches: int = 0
+    """Where in the file the last one ends [bytes]."""
 
     def note(self, offset: int, size: int, what: str) -> None:
         """Count one damaged place."""
         self.lost_bytes += size
+        self.count += 1
+        self.reaches = max(self.reaches, offset + size)
         if len(self.places) < 20:
             self.places.append(f"byte {offset}: {what}, {size} bytes lost")
 
