@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 
 from flightlog.errors import SwathError
+from onboard.journal import event
 
 _log = logging.getLogger(__name__)
 
@@ -56,10 +57,10 @@ class Worker(threading.Thread, ABC):
             self.work()
         except SwathError as error:
             self.failure = f"{self.name}: {error}"
-            _log.error("%s", self.failure)
+            _log.error("%s", self.failure, extra=event("failure", worker=self.name))
         except OSError as error:  # a disk or a device, not a mistake of ours
             self.failure = f"{self.name}: {error.strerror or error}"
-            _log.error("%s", self.failure)
+            _log.error("%s", self.failure, extra=event("failure", worker=self.name))
         except Exception as error:
             self.failure = f"{self.name}: {type(error).__name__}: {error}"
-            _log.exception("%s died", self.name)
+            _log.exception("%s died", self.name, extra=event("failure", worker=self.name))
