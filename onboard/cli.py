@@ -10,7 +10,7 @@ from pathlib import Path
 
 from flightlog import __version__
 from flightlog.errors import SwathError
-from onboard.commands import gate, install, lidar, uninstall
+from onboard.commands import gate, install, lidar, parameters, uninstall
 
 _CONFIG = Path("/etc/swathd/swathd.yaml")
 _RUNTIME = Path("/run/swathd")
@@ -43,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     health.add_argument("--json", action="store_true", help="the whole status, with the verdict")
     health.set_defaults(command=_health)
 
-    for command in (lidar, install, uninstall, gate):
+    for command in (lidar, parameters, install, uninstall, gate):
         name = command.__name__.rpartition(".")[2]
         child = commands.add_parser(name, help=command.HELP, description=command.HELP)
         command.add_arguments(child)
