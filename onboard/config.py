@@ -1,6 +1,7 @@
 """What the operator of the aircraft may set; `swathd config` prints the file with every default."""
 
 from dataclasses import dataclass, field
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Final
 
@@ -36,6 +37,16 @@ class LidarConfig:
         minimum=1, maximum=200,
     )  # fmt: skip
     fov: FovConfig = option(FovConfig, "what is kept; the rest looks at the airframe")
+    sensor: str | None = option(
+        None, "address of the lidar: packets of all others are refused; null: that of the first good packets"
+    )
+    interface: str | None = option(
+        None, "network interface of the lidar, to tell a pulled cable; null: found by the lidar's address"
+    )
+
+    def __post_init__(self) -> None:
+        if self.sensor is not None:
+            IPv4Address(self.sensor)
 
 
 @dataclass(frozen=True, slots=True)

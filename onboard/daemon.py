@@ -7,20 +7,20 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Final
 
 from flightlog import __version__, config, records
-from flightlog.constants import NS_PER_MS, NS_PER_S
+from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mount import Mount, load_mount
 from onboard import health, notify
-from onboard.autopilot import Link, LinkCounts
+from onboard.autopilot import Link
 from onboard.config import SwathdConfig
-from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status
-from onboard.lidar import LidarCounts, LidarPort
+from onboard.health import RecorderStatus, Status
+from onboard.lidar import LidarPort
+from onboard.readings import LidarReadings, Rates, link_status
 from onboard.recorder import Recorder, Segment, next_segment_path, write_atomically
 from onboard.timesync import ClockWatch, LogTime, read_clocks
 from onboard.worker import Worker
@@ -72,7 +72,8 @@ class Daemon:
             raise
         for name, link in settings.links().items():
             self._links[name] = Link(name, link, self._log_time, self._put)
-        self._rates = _Rates()
+        self._rates = Rates()
+        self._lidar_readings = LidarReadings(self._lidar, settings.lidar.interface)
 
     def _open_segment(self, settings: SwathdConfig, mount: Mount) -> Segment:
         path = next_segment_path(self._directory, self._boot_id)
@@ -196,9 +197,9 @@ class Daemon:
             pid=os.getpid(),
             uptime_s=(now.monotonic_ns - self._started_ns) / NS_PER_S,
             clock_steps=self._clock_watch.steps,
-            lidar=_lidar_status(self._lidar.counts, log_ns, self._rates.per_second),
+            lidar=self._lidar_readings.status(log_ns, self._rates.per_second),
             links={
-                name: _link_status(name, link.counts, log_ns, self._rates.per_second)
+                name: link_status(name, link.counts, log_ns, self._rates.per_second)
                 for name, link in self._links.items()
             },
             recorder=self._recorder_status(now.monotonic_ns),
@@ -219,67 +220,6 @@ class Daemon:
             slowest_sync_ms=counts.slowest_sync_ms,
             free_bytes=disk.f_bavail * disk.f_frsize,
         )
-
-
-class _Rates:
-    """Counts per second, from one status to the next."""
-
-    def __init__(self) -> None:
-        self._then_ns = self._now_ns = time.monotonic_ns()
-        self._counts: dict[str, int] = {}
-
-    def begin(self, now_ns: int) -> None:
-        """Begin a status."""
-        self._then_ns, self._now_ns = self._now_ns, now_ns
-
-    def per_second(self, name: str, count: int) -> float:
-        """Rate of a count since the status before."""
-        new = count - self._counts.get(name, 0)
-        self._counts[name] = count
-        return round(new * NS_PER_S / max(self._now_ns - self._then_ns, NS_PER_MS), 1)
-
-
-_PerSecond = Callable[[str, int], float]
-
-
-def _age_s(newest_ns: int, log_ns: int) -> float | None:
-    return (log_ns - newest_ns) / NS_PER_S if newest_ns else None
-
-
-def _lidar_status(counts: LidarCounts, log_ns: int, per_second: _PerSecond) -> LidarStatus:
-    return LidarStatus(
-        age_s=_age_s(counts.newest_ns, log_ns),
-        packets_s=per_second("lidar", counts.received),
-        position_packets_s=per_second("position", counts.position_received),
-        received=counts.received,
-        kept=counts.kept,
-        masked_packets=counts.masked_packets,
-        kernel_drops=counts.kernel_drops,
-        queue_drops=counts.queue_drops,
-        position_kept=counts.position_kept,
-        position_drops=counts.position_kernel_drops + counts.position_queue_drops,
-        rejected=dict(counts.rejected),
-        pps=counts.pps,
-        nmea=counts.nmea,
-    )
-
-
-def _link_status(name: str, counts: LinkCounts, log_ns: int, per_second: _PerSecond) -> LinkStatus:
-    return LinkStatus(
-        connected=counts.connected,
-        trouble=counts.trouble,
-        age_s=_age_s(counts.newest_ns, log_ns),
-        frames_s=per_second(f"{name} frames", counts.frames),
-        bytes_s=per_second(f"{name} bytes", counts.received_bytes),
-        autopilot="" if counts.autopilot is None else "{}/{}".format(*counts.autopilot),
-        version=counts.version,
-        heartbeats=counts.heartbeats,
-        armed=counts.armed,
-        bad_bytes=counts.bad_bytes,
-        unknown_frames=counts.unknown_frames,
-        dropped_bytes=counts.queue_dropped_bytes,
-        kernel_drops=counts.kernel_drops,
-    )
 
 
 def boot_id() -> str:

@@ -16,12 +16,13 @@ import numpy.typing as npt
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SourceError
+from onboard import packetfilter
 
 SO_TIMESTAMPNS: Final = 35
 SO_RXQ_OVFL: Final = 40
 SO_MEMINFO: Final = 55
-_MEMINFO_DROPS: Final = 8
-"""Index into what SO_MEMINFO gives (linux/sock_diag.h, SK_MEMINFO_DROPS)."""
+_MEMINFO: Final = struct.Struct("=9I")
+"""What SO_MEMINFO gives (linux/sock_diag.h): first the bytes queued and the limit of the queue, last the drops."""
 MAX_DATAGRAMS: Final = 1024
 """The kernel takes no more in one call (UIO_MAXIOV)."""
 
@@ -35,6 +36,8 @@ _MESSAGE_DTYPE: Final = np.dtype(
     }
 )
 """struct mmsghdr."""
+_NAME_DTYPE: Final = np.dtype([("family", "<u2"), ("port", ">u2"), ("address", ">u4"), ("zero", "V8")])
+"""struct sockaddr_in."""
 _CONTROL_DTYPE: Final = np.dtype(
     [
         ("size", "<u8"), ("level", "<i4"), ("kind", "<i4"), ("sec", "<i8"), ("nanosec", "<i8"),
@@ -44,6 +47,9 @@ _CONTROL_DTYPE: Final = np.dtype(
 """The two control messages of a datagram: SO_TIMESTAMPNS always, then SO_RXQ_OVFL once anything was dropped (sock_recv_cmsgs)."""
 _WITH_TIME: Final = 32
 _WITH_DROPS: Final = 52
+
+_CROWDED: Final = 0.7
+"""A queue fuller than this may have overflowed; the kernel gives memory back late, by up to a quarter of the limit."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
@@ -96,6 +102,8 @@ class Receiver:
         The kernel's receive time on the wall clock [ns]; 0 where it gave none.
     drops : int
         Datagrams lost in the socket since it was opened, as far as known.
+    refused : int
+        Datagrams that the socket's filter refused.
     """
 
     def __init__(self, sock: socket.socket, slots: npt.NDArray[np.generic], offset: int, size: int) -> None:
@@ -106,20 +114,45 @@ class Receiver:
         self._sock, self._slots, self._limit = sock, slots, size
         self.sizes = np.zeros(count, np.int64)
         self.stamps_ns = np.zeros(count, np.int64)
-        self.drops = 0
+        self.drops = self.refused = 0
+        self._counter = 0
+        self._is_filtered = self._was_crowded = False
+        self._names = np.zeros(count, _NAME_DTYPE)
         self._iov = np.zeros(count, _IOVEC_DTYPE)
         self._control = np.zeros(count, _CONTROL_DTYPE)
         self._messages = np.zeros(count, _MESSAGE_DTYPE)
         index = np.arange(count, dtype=np.uint64)
         self._iov["base"] = slots.ctypes.data + offset + index * np.uint64(slots.dtype.itemsize)
         self._iov["size"] = size
+        self._messages["name"] = self._names.ctypes.data + index * np.uint64(_NAME_DTYPE.itemsize)
+        self._messages["name_size"] = _NAME_DTYPE.itemsize
         self._messages["iov"] = self._iov.ctypes.data + index * np.uint64(_IOVEC_DTYPE.itemsize)
         self._messages["iov_count"] = 1
         self._messages["control"] = self._control.ctypes.data + index * np.uint64(_CONTROL_DTYPE.itemsize)
         self._messages["control_size"] = _CONTROL_DTYPE.itemsize
 
+    @property
+    def sources(self) -> npt.NDArray[np.uint32]:
+        """IPv4 address of each datagram's sender, shape (n,)."""
+        return np.asarray(self._names["address"], np.uint32)
+
+    def filter(self, payload_bytes: int, source: int) -> None:
+        """Have the kernel refuse all but datagrams of one length from one IPv4 address."""
+        self.count_last_drops()
+        packetfilter.attach(self._sock, payload_bytes, source)
+        self._is_filtered = True
+
+    def unfilter(self) -> None:
+        """Let everything in again."""
+        if self._is_filtered:
+            self.count_last_drops()
+            packetfilter.detach(self._sock)
+            self._is_filtered = False
+
     def receive(self, first: int = 0) -> int:
         """Take what is waiting into the elements from `first` on; gives the number of datagrams, never waits."""
+        if self._is_filtered:
+            self.count_last_drops()
         room = len(self._slots) - first
         address = self._messages.ctypes.data + first * _MESSAGE_DTYPE.itemsize
         count = int(_libc.recvmmsg(self._sock.fileno(), address, room, socket.MSG_DONTWAIT, None))
@@ -143,15 +176,30 @@ class Receiver:
         if control_size.min() < _WITH_TIME:
             stamps_ns[control_size < _WITH_TIME] = 0
         self.stamps_ns[part] = stamps_ns
-        if control_size[-1] >= _WITH_DROPS:
-            self._count_drops(int(control["drops"][-1]))
+        if control_size[-1] >= _WITH_DROPS and not self._is_filtered:
+            self._count_drops(int(control["drops"][-1]), is_lost=True)
         control_size[:] = _CONTROL_DTYPE.itemsize
 
     def count_last_drops(self) -> None:
-        """Ask the kernel for drops that no later datagram has told of."""
-        answer = self._sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 64)
-        if len(answer) >= 4 * (_MEMINFO_DROPS + 1):
-            self._count_drops(struct.unpack_from("<I", answer, 4 * _MEMINFO_DROPS)[0])
+        """Ask the kernel for drops that no later datagram has told of.
 
-    def _count_drops(self, counter: int) -> None:
-        self.drops += (counter - self.drops) % (1 << 32)
+        It counts what the filter refused and what found no room alike. But the queue only grows until we empty it: where it had room
+        to spare both now and the time before, nothing can have been lost in between, and it was the filter.
+        """
+        answer = self._sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 64)
+        if len(answer) < _MEMINFO.size:
+            return
+        queued, limit, *_, counter = _MEMINFO.unpack_from(answer)
+        is_crowded = queued > limit * _CROWDED
+        self._count_drops(counter, is_lost=is_crowded or self._was_crowded or not self._is_filtered)
+        self._was_crowded = is_crowded
+
+    def _count_drops(self, counter: int, *, is_lost: bool) -> None:
+        new = (counter - self._counter) % (1 << 32)
+        if new >> 31:  # of a datagram that was queued before we asked
+            return
+        self._counter = counter
+        if is_lost:
+            self.drops += new
+        else:
+            self.refused += new

@@ -9,11 +9,10 @@ from typing import Any, Final
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
+from onboard.lidarstate import REMEDY, State
 
 STALE_S: Final = 5.0
 """A status older than this says nothing about now."""
-SILENT_S: Final = 1.0
-"""A lidar unheard for this long is silent; it sends every 0.6 ms."""
 LINK_SILENT_S: Final = 3.0
 """An autopilot unheard for this long is silent; it sends a heartbeat each second."""
 STALLED_NS: Final = 5 * NS_PER_S
@@ -32,18 +31,31 @@ class Level(IntEnum):
 class LidarStatus:
     """The lidar's two ports; totals since the start, rates over the last second."""
 
+    state: State = State.GOOD
+    link: bool | None = None
+    """Whether its network link is up; None: not known."""
+    sensor: str = ""
+    """Its address."""
     age_s: float | None = None
     """Since the newest good data packet; None: there was none."""
     packets_s: float = 0.0
+    expected_packets_s: float = 0.0
+    """At its return mode and field of view; 0: not known."""
+    return_mode: str = ""
+    rpm: float = 0.0
+    fov_start_deg: float = 0.0
+    fov_end_deg: float = 0.0
     position_packets_s: float = 0.0
     received: int = 0
     kept: int = 0
+    not_armed: int = 0
     masked_packets: int = 0
     kernel_drops: int = 0
     queue_drops: int = 0
     position_kept: int = 0
     position_drops: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
+    rejected_s: float = 0.0
     pps: int = 0
     nmea: str = ""
 
@@ -108,7 +120,7 @@ def from_json(text: str, place: str) -> Status:
     """Read the text of a status file; SwathError where it is none, `place` names it."""
     try:
         tree: dict[str, Any] = json.loads(text)
-        tree["lidar"] = LidarStatus(**tree["lidar"])
+        tree["lidar"] = LidarStatus(**tree["lidar"] | {"state": State(tree["lidar"]["state"])})
         tree["links"] = {name: LinkStatus(**link) for name, link in tree["links"].items()}
         tree["recorder"] = RecorderStatus(**tree["recorder"])
         return Status(**tree)
@@ -175,12 +187,12 @@ def armed(status: Status, now_ns: int, boot_id: str) -> bool | None:
 
 def _judge_lidar(lidar: LidarStatus) -> list[tuple[Level, str]]:
     found = []
-    if lidar.age_s is None and lidar.rejected:
-        found.append((Level.CRITICAL, "lidar: packets arrive, but none is an HDL-32E's"))
-    elif lidar.age_s is None:
-        found.append((Level.CRITICAL, "lidar: no packet yet; check power, cable and addresses"))
-    elif lidar.age_s > SILENT_S:
-        found.append((Level.CRITICAL, f"lidar: silent for {lidar.age_s:.0f} s"))
+    if lidar.state == State.RATE_LOW:
+        rates = f"{lidar.packets_s:.0f} packets/s, expected {lidar.expected_packets_s:.0f}"
+        found.append((Level.WARNING, f"lidar: rate low, {rates}; {REMEDY[lidar.state]}"))
+    elif lidar.state != State.GOOD:
+        since = "" if lidar.age_s is None else f" for {lidar.age_s:.0f} s"
+        found.append((Level.CRITICAL, f"lidar: {lidar.state}{since}; {REMEDY[lidar.state]}"))
     found += [(Level.WARNING, f"lidar: {count} x {reason}") for reason, count in lidar.rejected.items()]
     if lidar.kernel_drops:
         found.append((Level.WARNING, f"lidar: {lidar.kernel_drops} packets lost in the receive buffer"))

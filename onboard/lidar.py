@@ -1,30 +1,30 @@
 """The HDL-32E's two UDP ports: packets checked, stamped, masked, batched, handed to the recorder; every loss counted."""
 
 import logging
-import socket
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flightlog import hdl32e, records
-from flightlog.constants import NS_PER_MS, NS_PER_S
+from flightlog.constants import NS_PER_S
 from flightlog.records import SCAN_PACKET_DTYPE, LidarAccount
-from onboard import fovmask
+from onboard import fovmask, lidarstate
+from onboard.batch import BATCH_NS, Batch
 from onboard.config import LidarConfig
-from onboard.datagrams import Receiver, granted_buffer_bytes, open_udp
+from onboard.datagrams import granted_buffer_bytes, open_udp
 from onboard.fovmask import Window
-from onboard.timesync import KernelTime, LogTime, read_clocks
+from onboard.packetfilter import address_number, address_text
+from onboard.sensorview import SECTORS, SensorView, sectors_seen, view
+from onboard.timesync import LogTime
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
 
-BATCH_NS: Final = 100 * NS_PER_MS
-"""A message of the log spans about this much."""
 _DATA_SLOTS: Final = 512
 _SMALL_BUFFER_BYTES: Final = 1 << 20
 _SMALL_BUFFER_POLL_S: Final = 0.02
@@ -32,6 +32,10 @@ _SMALL_BUFFER_POLL_S: Final = 0.02
 _IDLE_POLL_S: Final = 0.02
 """While nothing comes: what comes next may come at any rate."""
 _POSITION_SLOTS: Final = 128
+_OPEN_NS: Final = 3 * NS_PER_S
+"""A lidar silent for this long: everything is let in and looked at again, to tell why; it is not recorded."""
+_FORGET_NS: Final = 10 * NS_PER_S
+"""A lidar silent for this long may come back with another address, unless the configuration says which it has."""
 
 Put = Callable[[str, int, bytes, bool], bool]
 """Hands a message to the recorder: topic, log time, bytes, whether it is small and must not be lost; False if it was refused."""
@@ -42,7 +46,11 @@ class LidarCounts:
     """What became of everything that arrived at the lidar's ports since the start."""
 
     received: int = 0
+    good: int = 0
+    """Data packets of the lidar, recorded or not."""
     kept: int = 0
+    not_armed: int = 0
+    """Good ones not recorded, because the vehicle was not armed."""
     masked_packets: int = 0
     masked_blocks: int = 0
     kernel_drops: int = 0
@@ -59,6 +67,12 @@ class LidarCounts:
     """The newest position packet's PPS state; what it means is in hdl32e.PpsState."""
     nmea: str = ""
     """The newest position packet's sentence."""
+    position_ns: int = 0
+    """Log time of that packet [ns]."""
+    stamp_us: int = 0
+    """The newest good data packet's own stamp [us past the hour]."""
+    sensor: str = ""
+    """Address of the lidar, once it is known."""
 
 
 class LidarPort(Worker):
@@ -70,6 +84,8 @@ class LidarPort(Worker):
     log_time : LogTime
     put : callable
         The recorder's.
+    wanted : callable
+        Whether lidar packets are to be recorded now.
 
     Raises
     ------
@@ -77,9 +93,18 @@ class LidarPort(Worker):
         A port cannot be opened.
     """
 
-    def __init__(self, config: LidarConfig, log_time: LogTime, put: Put) -> None:
+    def __init__(
+        self, config: LidarConfig, log_time: LogTime, put: Put, wanted: Callable[[], bool] = lambda: True
+    ) -> None:
         super().__init__("lidar")
         self.counts = LidarCounts()
+        self._wanted = wanted
+        self._sensor = None if config.sensor is None else address_number(config.sensor)
+        self._is_pinned = config.sensor is not None
+        self._is_filtered = False
+        self._heard_ns = time.monotonic_ns()
+        self._seen = np.zeros(SECTORS, np.bool_)
+        self._newest: npt.NDArray[np.void] | None = None
         self.window = Window.from_degrees(config.fov.start_deg, config.fov.end_deg)
         self._put = put
         buffer_bytes = config.receive_buffer_kb * 1024
@@ -90,10 +115,10 @@ class LidarPort(Worker):
             self._data_socket.close()
             raise
         self._poll_s = self._pause_for_buffer(config.poll_ms / 1e3, buffer_bytes)
-        self._data = _Batch(
+        self._data = Batch(
             self._data_socket, SCAN_PACKET_DTYPE, 8, hdl32e.DATA_BYTES, _DATA_SLOTS, log_time, self._poll_s
         )
-        self._position = _Batch(
+        self._position = Batch(
             self._position_socket,
             hdl32e.POSITION_DTYPE,
             0,
@@ -131,6 +156,7 @@ class LidarPort(Worker):
                 if now_ns >= position_due_ns:
                     self._poll(self._position, self._close_position)
                     position_due_ns = now_ns + BATCH_NS // 2
+                self._watch_sensor(now_ns)
                 self.progress()
                 time.sleep(self._pause_s(found, now_ns - before_ns))
                 before_ns = now_ns
@@ -149,7 +175,7 @@ class LidarPort(Worker):
             return min(self._poll_s, _IDLE_POLL_S)
         return min(self._poll_s, _DATA_SLOTS * within_ns / (found * NS_PER_S))
 
-    def _poll(self, batch: "_Batch", close: "Callable[[_Batch], None]") -> int:
+    def _poll(self, batch: Batch, close: Callable[[Batch], None]) -> int:
         """Empty a socket; gives the number of datagrams found."""
         found = batch.fill()
         while batch.full and not self.stopping:  # there may be more
@@ -160,41 +186,99 @@ class LidarPort(Worker):
             close(batch)
         return found
 
+    # The sensor and others ----------------------------------------------------------------------------------------
+
+    def view(self) -> SensorView | None:
+        """How the lidar is set, by what came since this was last asked; None: nothing came."""
+        seen, self._seen = self._seen, np.zeros(SECTORS, np.bool_)
+        return None if self._newest is None or not seen.any() else view(self._newest, seen)
+
+    def _adopt(self, sources: npt.NDArray[np.uint32]) -> None:
+        """Take the sender of most good packets for the lidar, and have the kernel refuse all others."""
+        addresses, counts = np.unique(sources, return_counts=True)
+        self._sensor = int(addresses[np.argmax(counts)])
+        _log.info("the lidar is at %s", address_text(self._sensor))
+
+    def _heard(self, packets: npt.NDArray[np.void]) -> None:
+        """Note good packets of the lidar."""
+        assert self._sensor is not None
+        self._heard_ns = time.monotonic_ns()
+        self._seen |= sectors_seen(packets["data"])
+        self._newest = packets["data"][-1:].copy()
+        self.counts.good += len(packets)
+        self.counts.stamp_us = int(self._newest["stamp_us"][0])
+        if not self._is_filtered:
+            self._is_filtered = True
+            self.counts.sensor = address_text(self._sensor)
+            self._data.receiver.filter(hdl32e.DATA_BYTES, self._sensor)
+            self._position.receiver.filter(hdl32e.POSITION_BYTES, self._sensor)
+
+    def _watch_sensor(self, now_ns: int) -> None:
+        """Let everything in while the lidar is silent, to tell why it is."""
+        silent_ns = now_ns - self._heard_ns
+        if self._is_filtered and silent_ns > _OPEN_NS:
+            self._is_filtered = False
+            self._data.receiver.unfilter()
+            self._position.receiver.unfilter()
+        if self._sensor is not None and not self._is_pinned and silent_ns > _FORGET_NS:
+            _log.warning("the lidar at %s is silent; it may come back from another address", self.counts.sensor)
+            self._sensor = None
+
     # Data packets -------------------------------------------------------------------------------------------------
 
-    def _close_data(self, batch: "_Batch") -> None:
+    def _close_data(self, batch: Batch) -> None:
         """Sort a batch, hand it over with its account, begin the next."""
-        packets, sizes, time_ns = batch.take()
-        drops = batch.new_drops()
-        if not len(packets) and not drops:
+        packets, sizes, time_ns, sources = batch.take()
+        drops, refused = batch.new_drops()
+        if not len(packets) and not drops and not refused:
             return
         right_size = sizes == hdl32e.DATA_BYTES
-        whole = fovmask.select(packets, right_size) if not right_size.all() else packets
-        good = hdl32e.is_data(whole["data"])
+        good = right_size & hdl32e.is_data(packets["data"])
         if not good.all():
-            self._tell_foreign(whole["data"][~good])
-            whole = fovmask.select(whole, good)
-        masked = fovmask.apply(whole, self.window)
+            self._tell_foreign(packets["data"][right_size & ~good])
+        if self._sensor is None and good.any():
+            self._adopt(sources[good])
+        ours = good & (sources == (self._sensor or 0))
+        strangers = int((good & ~ours).sum())
+        self._reject(lidarstate.WRONG_SENDER, strangers)
+        self._reject(lidarstate.REFUSED, refused)
+        whole = packets if ours.all() else fovmask.select(packets, ours)
         stamp_ns = int(time_ns[-1]) if len(time_ns) else batch.now_ns()
+        if len(whole):
+            self._heard(whole)
+            self.counts.newest_ns = stamp_ns
+        account = LidarAccount(
+            received=len(packets) + refused,
+            rejected_length=len(packets) - int(right_size.sum()),
+            rejected_content=int((right_size & ~good).sum()),
+            rejected_sender=strangers + refused,
+            kernel_drops=drops,
+        )
+        if self._wanted():
+            self._record(whole, stamp_ns, account)
+        else:
+            self.counts.not_armed += len(whole)
+            self._count(account)
+
+    def _record(self, packets: npt.NDArray[np.void], stamp_ns: int, account: LidarAccount) -> None:
+        """Mask the lidar's packets and hand them over, with the account completed."""
+        masked = fovmask.apply(packets, self.window)
         written = len(masked.packets) > 0 and self._put(
             records.LIDAR.topic, stamp_ns, records.encode_scan(stamp_ns, masked.packets), False
         )
-        account = LidarAccount(
-            received=len(packets),
+        account = replace(
+            account,
             kept=len(masked.packets) if written else 0,
             masked_packets=masked.masked_packets,
             masked_blocks=masked.masked_blocks,
-            rejected_length=len(packets) - int(right_size.sum()),
-            rejected_content=int(right_size.sum()) - len(whole),
-            kernel_drops=drops,
             queue_drops=0 if written else len(masked.packets),
             fov_start_deg=self.window.start / 100 if self.window.width else 0.0,
             fov_end_deg=self.window.end / 100 if self.window.width else 0.0,
         )
         self._put(records.LIDAR_ACCOUNT.topic, stamp_ns, records.encode_account(stamp_ns, account), True)
-        self._count(account, stamp_ns if len(whole) else 0)
+        self._count(account)
 
-    def _count(self, account: LidarAccount, newest_ns: int) -> None:
+    def _count(self, account: LidarAccount) -> None:
         counts = self.counts
         counts.received += account.received
         counts.kept += account.kept
@@ -202,16 +286,15 @@ class LidarPort(Worker):
         counts.masked_blocks += account.masked_blocks
         counts.kernel_drops += account.kernel_drops
         counts.queue_drops += account.queue_drops
-        counts.newest_ns = newest_ns or counts.newest_ns
-        self._reject("data packet of a wrong length", account.rejected_length)
+        self._reject(lidarstate.WRONG_LENGTH, account.rejected_length)
 
     def _tell_foreign(self, packets: npt.NDArray[np.void]) -> None:
         """Name what has a data packet's length and is none of an HDL-32E."""
         flagged = (packets["blocks"]["flag"] == hdl32e.BLOCK_FLAG).all(axis=1)
-        self._reject("data packet without block flags", int((~flagged).sum()))
+        self._reject(lidarstate.WRONG_CONTENT, int((~flagged).sum()))
         for product, count in Counter(packets["product"][flagged].tolist()).items():
             name = hdl32e.OTHER_PRODUCTS.get(product, f"unknown return mode or product 0x{product:02x}")
-            self._reject(f"data packet of another sensor: {name}", count)
+            self._reject(f"{lidarstate.WRONG_MODEL}: {name}", count)
 
     def _reject(self, reason: str, count: int) -> None:
         if not count:
@@ -223,9 +306,11 @@ class LidarPort(Worker):
 
     # Position packets ---------------------------------------------------------------------------------------------
 
-    def _close_position(self, batch: "_Batch") -> None:
-        packets, sizes, time_ns = batch.take()
-        self.counts.position_kernel_drops += batch.new_drops()
+    def _close_position(self, batch: Batch) -> None:
+        packets, sizes, time_ns, sources = batch.take()
+        drops, refused = batch.new_drops()
+        self.counts.position_kernel_drops += drops
+        self._reject("position " + lidarstate.REFUSED, refused)
         if not len(packets):
             return
         right_size = sizes == hdl32e.POSITION_BYTES
@@ -233,84 +318,21 @@ class LidarPort(Worker):
         self._reject("position packet of a wrong length", int((~right_size).sum()))
         self._reject("position packet with other content", int((right_size & ~good).sum()))
         self.counts.position_received += len(packets)
+        if self._sensor is not None:
+            strangers = good & (sources != self._sensor)
+            self._reject("position packet from another sender than the lidar", int(strangers.sum()))
+            good &= ~strangers
         kept, kept_ns = fovmask.select(packets, good), time_ns[good]
         if not len(kept):
             return
         stamp_ns = int(kept_ns[-1])
+        self.counts.pps = int(kept["pps"][-1])
+        self.counts.nmea = kept["nmea"][-1].split(b"\0")[0].decode("ascii", "replace").strip()
+        self.counts.position_ns = stamp_ns
+        if not self._wanted():
+            return
         chunks = [(stamp, packet.tobytes()) for stamp, packet in zip(kept_ns.tolist(), kept, strict=True)]
         if self._put(records.POSITION.topic, stamp_ns, records.encode_raw(stamp_ns, chunks, "velodyne"), False):
             self.counts.position_kept += len(kept)
         else:
             self.counts.position_queue_drops += len(kept)
-        self.counts.pps = int(kept["pps"][-1])
-        self.counts.nmea = kept["nmea"][-1].split(b"\0")[0].decode("ascii", "replace").strip()
-
-
-class _Batch:
-    """Slots that fill up from poll to poll, with the receive times of what is in them."""
-
-    def __init__(
-        self,
-        sock: socket.socket,
-        dtype: np.dtype[np.void],
-        offset: int,
-        size: int,
-        slots: int,
-        log_time: LogTime,
-        poll_s: float,
-    ) -> None:
-        self._slots = np.zeros(slots, dtype)
-        self._time_ns = np.zeros(slots, np.int64)
-        self._count = 0
-        self._poll_ns = round(poll_s * NS_PER_S)
-        self._drops_told = 0
-        self._log_time = log_time
-        self._now = read_clocks()
-        self._kernel_time = KernelTime(log_time, self._now)
-        self.receiver = Receiver(sock, self._slots, offset, size)
-
-    @property
-    def full(self) -> bool:
-        """Whether no slot is left."""
-        return self._count == len(self._slots)
-
-    def fill(self) -> int:
-        """Take what is waiting, as far as there are slots; gives the number of datagrams."""
-        first = self._count
-        count = self.receiver.receive(first)
-        if count:
-            self._now = read_clocks()
-            part = slice(first, first + count)
-            stamps_ns = self.receiver.stamps_ns[part]
-            stamps_ns[stamps_ns == 0] = self._now.realtime_ns
-            self._time_ns[part] = self._kernel_time.convert(
-                stamps_ns, self._now, emptied=first + count < len(self._slots)
-            )
-            self._count += count
-        return count
-
-    def due(self) -> bool:
-        """Whether what is in here will be as old as a message may be before anyone looks again."""
-        if not self._count:
-            return False
-        age_ns = self._log_time.anchor_ns + time.monotonic_ns() - int(self._time_ns[0])
-        return age_ns >= BATCH_NS - self._poll_ns // 2
-
-    def take(self) -> tuple[npt.NDArray[np.void], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Datagrams with receive time (in data packets also inside), their sizes; valid until the next `fill`."""
-        part = slice(0, self._count)
-        self._count = 0
-        packets, time_ns = self._slots[part], self._time_ns[part]
-        if packets.dtype == SCAN_PACKET_DTYPE:
-            records.set_receive_time_ns(packets, time_ns)
-        return packets, self.receiver.sizes[part], time_ns
-
-    def new_drops(self) -> int:
-        """Datagrams the kernel dropped since this was last asked."""
-        new = self.receiver.drops - self._drops_told
-        self._drops_told = self.receiver.drops
-        return new
-
-    def now_ns(self) -> int:
-        """Log time [ns]."""
-        return self._log_time.at(read_clocks())

@@ -425,7 +425,7 @@ def test_recording_goes_on_without_any_autopilot_or_lidar(tmp_path: Path) -> Non
         time.sleep(1.2)
         health = daemon.health()
         assert health.returncode == 2
-        assert "lidar: no packet yet" in health.stdout
+        assert "lidar: no " in health.stdout  # no packets, or no link
         assert f"link ins: serial device {tmp_path}/no-such-device cannot be opened" in health.stdout
         stderr = daemon.stop()
         assert daemon.process.returncode == 0

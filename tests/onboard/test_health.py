@@ -5,6 +5,7 @@ import pytest
 from flightlog.errors import SwathError
 from onboard import health
 from onboard.health import Level, LidarStatus, LinkStatus, RecorderStatus, Status
+from onboard.lidarstate import State
 
 S = 1_000_000_000
 GOOD = Status(
@@ -32,9 +33,14 @@ def test_all_well_is_good() -> None:
 @pytest.mark.parametrize(
     ("lidar", "level", "finding"),
     [
-        (LidarStatus(), 2, "lidar: no packet yet; check power, cable and addresses"),
-        (LidarStatus(rejected={"odd": 3}), 2, "lidar: packets arrive, but none is an HDL-32E's"),
-        (LidarStatus(age_s=3.0), 2, "lidar: silent for 3 s"),
+        (LidarStatus(state=State.NO_LINK), 2,
+         "lidar: no link; is the cable plugged in and the lidar powered?"),
+        (LidarStatus(state=State.NO_PACKETS), 2,
+         "lidar: no packets; none yet, but a network link is up; check its destination address and the ports"),
+        (LidarStatus(state=State.SILENT, age_s=3.0), 2,
+         "lidar: silent for 3 s; the network link is not down; check its power and its laser switch"),
+        (LidarStatus(state=State.RATE_LOW, age_s=0.1, packets_s=900.0, expected_packets_s=1808.0), 1,
+         "lidar: rate low, 900 packets/s, expected 1808; check cable, network load and receive buffer"),
         (LidarStatus(age_s=0.1, kernel_drops=5), 1, "lidar: 5 packets lost in the receive buffer"),
         (LidarStatus(age_s=0.1, queue_drops=5), 1, "lidar: 5 packets lost because the disk was too slow"),
         (LidarStatus(age_s=0.1, rejected={"data packet of another sensor: VLP-16": 2}), 1,

@@ -1,0 +1,209 @@
+"""Who may send to the lidar's ports, with real sockets: on the loopback, and over a cable between network namespaces."""
+
+import socket
+import struct
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from lidar_stream import cable, from_address, inside, needs_namespaces, packet, run
+
+from flightlog import records
+from onboard import lidar, lidarstate
+from onboard.config import FovConfig, LidarConfig
+from onboard.lidar import LidarPort
+from onboard.timesync import LogTime, read_clocks
+
+SENSOR, STRANGER = "127.0.0.2", "127.0.0.3"
+
+
+class Port:
+    """A lidar port of ours and what it handed over."""
+
+    def __init__(
+        self, address: str = "127.0.0.1", sensor: str | None = None, ports: tuple[int, int] | None = None
+    ) -> None:
+        self.ports = ports or (free_port(), free_port())
+        self.messages: list[tuple[str, bytes]] = []
+        config = LidarConfig(
+            address, *self.ports, poll_ms=20, receive_buffer_kb=2048, fov=FovConfig(0, 0), sensor=sensor
+        )
+        self.port = LidarPort(config, LogTime.start(read_clocks()), self.put)
+        self.port.start()
+
+    def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
+        del log_time_ns, vital
+        self.messages.append((topic, data))
+        return True
+
+    def stop(self) -> None:
+        time.sleep(0.3)
+        self.port.stop()
+        assert self.port.failure is None
+
+    def marks(self) -> dict[int, int]:
+        """Packets recorded by the mark in them."""
+        scans = [records.decode_scan(data) for topic, data in self.messages if topic == records.LIDAR.topic]
+        if not scans:
+            return {}
+        values, counts = np.unique(
+            np.concatenate(scans)["data"]["blocks"]["returns"]["intensity"][:, 0, 0], return_counts=True
+        )
+        return dict(zip(values.tolist(), counts.tolist(), strict=True))
+
+    def account(self, name: str) -> int:
+        accounts = [
+            records.decode_account(data) for topic, data in self.messages if topic == records.LIDAR_ACCOUNT.topic
+        ]
+        return sum(getattr(account, name) for account in accounts)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def until(condition: Callable[[], bool], seconds: float = 5.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def test_a_flood_of_look_alikes_never_reaches_the_file_and_costs_the_lidar_nothing() -> None:
+    port = Port()
+    to = ("127.0.0.1", port.ports[0])
+    with from_address(SENSOR) as sensor, from_address(STRANGER) as stranger:
+        for number in range(10):
+            sensor.sendto(packet(number), to)
+        until(lambda: port.port.counts.sensor == SENSOR)
+        hostile, sent = packet(5, mark=66), 0
+        for number in range(10, 400):
+            sensor.sendto(packet(number), to)
+            for _ in range(20):
+                stranger.sendto(hostile, to)
+                sent += 1
+            if number % 20 == 0:
+                time.sleep(0.01)
+    port.stop()
+    assert port.marks() == {1: 400}
+    assert port.account("kernel_drops") == 0  # what the filter refuses is no loss
+    assert port.account("rejected_sender") == sent
+    assert port.account("received") == 400 + sent
+    assert port.port.counts.rejected[lidarstate.REFUSED] > 0.99 * sent  # none of these reached us
+
+
+def test_a_lidar_named_in_the_configuration_is_the_only_one_from_the_first_packet() -> None:
+    port = Port(sensor=SENSOR)
+    to = ("127.0.0.1", port.ports[0])
+    with from_address(SENSOR) as sensor, from_address(STRANGER) as stranger:
+        for number in range(50):
+            stranger.sendto(packet(number, mark=66), to)
+        until(lambda: port.port.counts.rejected[lidarstate.WRONG_SENDER] == 50)
+        assert port.port.counts.newest_ns == 0
+        for number in range(50):
+            sensor.sendto(packet(number), to)
+    port.stop()
+    assert port.marks() == {1: 50}
+    assert port.account("rejected_sender") == 50
+
+
+def test_a_stranger_may_not_take_over_from_a_silent_lidar_before_it_is_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(lidar, "_OPEN_NS", 200_000_000)
+    monkeypatch.setattr(lidar, "_FORGET_NS", 1_500_000_000)
+    port = Port()
+    to = ("127.0.0.1", port.ports[0])
+    with from_address(SENSOR) as sensor, from_address(STRANGER) as other:
+        sensor.sendto(packet(0), to)
+        until(lambda: port.port.counts.sensor == SENSOR)
+        time.sleep(0.6)  # the kernel lets all in again, to tell why the lidar is silent
+        other.sendto(packet(1, mark=66), to)
+        until(lambda: port.port.counts.rejected[lidarstate.WRONG_SENDER] == 1)
+        other.sendto(packet(1)[:-1], to)
+        until(lambda: port.port.counts.rejected[lidarstate.WRONG_LENGTH] == 1)
+        assert port.marks() == {1: 1}
+        time.sleep(1.8)  # it was set to another address
+        other.sendto(packet(2, mark=7), to)
+        until(lambda: port.port.counts.sensor == STRANGER)
+    port.stop()
+    assert port.marks() == {1: 1, 7: 1}
+
+
+def test_position_packets_of_another_sender_are_not_the_lidars() -> None:
+    port = Port()
+    position = struct.pack("<14x12H", *[tag << 12 for tag in range(4)] * 3).ljust(512, b"\0")
+    with from_address(SENSOR) as sensor, from_address(STRANGER) as stranger:
+        sensor.sendto(packet(0), ("127.0.0.1", port.ports[0]))
+        until(lambda: port.port.counts.sensor == SENSOR)
+        for _ in range(5):
+            stranger.sendto(position, ("127.0.0.1", port.ports[1]))
+        for _ in range(3):
+            sensor.sendto(position, ("127.0.0.1", port.ports[1]))
+    port.stop()
+    assert port.port.counts.position_kept == 3
+    assert sum(count for reason, count in port.port.counts.rejected.items() if reason.startswith("position")) == 5
+
+
+def test_a_full_buffer_is_a_loss_and_not_a_refusal() -> None:
+    port = Port()
+    to = ("127.0.0.1", port.ports[0])
+    with from_address(SENSOR) as sensor:
+        sensor.sendto(packet(0), to)
+        until(lambda: port.port.counts.sensor == SENSOR)
+        receiver = port.port._data.receiver
+        port.port.stop()  # nobody empties the socket from here on
+    assert receiver.refused == 0
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, from_address(SENSOR) as sensor:
+        sock.bind(("127.0.0.1", 0))
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        slow = lidar.Batch(sock, records.SCAN_PACKET_DTYPE, 8, 1206, 512, LogTime(0), 0.02)
+        slow.receiver.filter(1206, int.from_bytes(socket.inet_aton(SENSOR)))
+        for number in range(500):
+            sensor.sendto(packet(number), sock.getsockname())
+        found = 0
+        while count := slow.fill():
+            found += count
+        slow.receiver.count_last_drops()
+        assert found < 400
+        assert (slow.receiver.drops, slow.receiver.refused) == (500 - found, 0)
+
+
+@pytest.mark.root
+def test_the_addresses_of_old_firmware_are_heard() -> None:
+    needs_namespaces()
+    with cable(["192.168.3.1/24"], ["192.168.17.162/32"]) as (aboard, sensor):
+        run("ip", "-n", sensor, "route", "add", "broadcast", "192.168.3.255", "dev", "head0", "src", "192.168.17.162")
+        port = inside(aboard, lambda: Port("0.0.0.0", ports=(2368, 8308)))
+        with inside(sensor, lambda: from_address("192.168.17.162", 443)) as sock:
+            for number in range(100):
+                sock.sendto(packet(number), ("192.168.3.255", 2368))
+        port.stop()
+        assert port.port.counts.sensor == "192.168.17.162"
+        assert port.marks() == {1: 100}
+
+
+@pytest.mark.root
+def test_the_addresses_of_new_firmware_are_heard_and_broadcasts_of_others_refused() -> None:
+    needs_namespaces()
+    with cable(["192.168.1.10/24"], ["192.168.1.201/24", "192.168.1.66/24"]) as (aboard, sensor):
+        run("ip", "-n", sensor, "route", "add", "default", "dev", "head0", "src", "192.168.1.201")
+        port = inside(aboard, lambda: Port("0.0.0.0", ports=(2368, 8308)))
+        with (
+            inside(sensor, lambda: from_address("192.168.1.201", 2368)) as lidar_head,
+            inside(sensor, lambda: from_address("192.168.1.66", 2368)) as stranger,
+        ):
+            lidar_head.sendto(packet(0), ("255.255.255.255", 2368))
+            until(lambda: port.port.counts.sensor == "192.168.1.201")
+            for number in range(1, 300):
+                lidar_head.sendto(packet(number), ("255.255.255.255", 2368))
+                for _ in range(5):
+                    stranger.sendto(packet(number, mark=66), ("255.255.255.255", 2368))
+        port.stop()
+        assert port.marks() == {1: 300}
+        assert port.account("rejected_sender") == 299 * 5
+        assert port.account("kernel_drops") == 0
