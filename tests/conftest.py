@@ -108,12 +108,12 @@ def plain_flight(simulated: Callable[..., Simulated]) -> Simulated:
 
 @pytest.fixture(scope="session")
 def dual_flight(simulated: Callable[..., Simulated]) -> Simulated:
-    """2 s in the village in dual return mode: too short to synchronise by gyros."""
+    """3 s in the village in dual return mode: too short to synchronise by gyros."""
     from simulator.config import Options
 
     options = Options()
     options = replace(options, lidar=replace(options.lidar, returns="dual"))
-    return simulated("dual_flight", "village", 2.0, options, every=2)
+    return simulated("dual_flight", "village", 3.0, options, every=3)
 
 
 @pytest.fixture(scope="session")
@@ -136,3 +136,11 @@ def rebooted_flight(simulated: Callable[..., Simulated]) -> Simulated:
         link=replace(options.link, version=2),
     )
     return simulated("rebooted_flight", "village", 45.0, options, every=20)
+
+
+@pytest.fixture(scope="session")
+def perfect_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """15 s round the village with perfect instruments; clocks still differ and drift."""
+    from simulator.config import Options, perfect
+
+    return simulated("perfect_flight", "village", 15.0, perfect(Options()), every=50)
