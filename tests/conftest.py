@@ -1,4 +1,4 @@
-"""Simulated flights that tests of several packages process: made once for a test run, whatever the number of its workers."""
+"""Recordings, and simulated flights that several tests process: made once for a test run, whatever the number of its workers."""
 
 import json
 import os
@@ -144,3 +144,22 @@ def perfect_flight(simulated: Callable[..., Simulated]) -> Simulated:
     from simulator.config import Options, perfect
 
     return simulated("perfect_flight", "village", 15.0, perfect(Options()), every=50)
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    folder = os.environ.get("SWATH_RECORDINGS")
+    if not folder:
+        pytest.skip("SWATH_RECORDINGS is not set: no recordings to test with")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def monterey_log(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recorded HDL-32E and the copter's telemetry log, imported."""
+    from groundproc.cli import main
+
+    path = tmp_path_factory.mktemp("monterey") / "monterey.mcap"
+    words = ["import", "--pcap", str(recordings / "lidar/hdl32e_monterey.pcap"), "-o", str(path)]
+    assert main([*words, "--mavlink", str(recordings / "mavlink/copter_flight_2015.tlog")]) == 0
+    return path

@@ -21,11 +21,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Decode, with a progress bar on a terminal."""
+    from flightlog.errors import UsageError
     from groundproc.decode import Gate
     from groundproc.options import field_of_view
     from groundproc.progress import stages
     from groundproc.sensor_cloud import write_sensor_cloud
 
+    if not 0.0 <= arguments.min_range <= arguments.max_range:
+        raise UsageError(
+            f"--min-range {arguments.min_range:g} --max-range {arguments.max_range:g}: expected 0 or more, and the first no larger"
+        )
     gate = Gate(*field_of_view(arguments.fov), arguments.min_range, arguments.max_range)
     with stages(arguments.logs, {"decode": "points"}) as progress:
         cloud = write_sensor_cloud(arguments.logs, arguments.output, gate, lambda done: progress("decode", done))

@@ -1,6 +1,5 @@
 """Recordings, and small captures made with struct alone, so that no writer of the project stands between file and test."""
 
-import os
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,14 +10,6 @@ import pytest
 
 if TYPE_CHECKING:
     from flightlog.mavlink import Frame
-
-
-@pytest.fixture(scope="session")
-def recordings() -> Path:
-    folder = os.environ.get("SWATH_RECORDINGS")
-    if not folder:
-        pytest.skip("SWATH_RECORDINGS is not set: no recordings to test with")
-    return Path(folder)
 
 
 @pytest.fixture(scope="session")
@@ -110,17 +101,6 @@ def pcap() -> Callable[..., bytes]:
         return head + b"".join(records)
 
     return make
-
-
-@pytest.fixture(scope="session")
-def monterey_log(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recorded HDL-32E and the copter's telemetry log, imported."""
-    from groundproc.cli import main
-
-    path = tmp_path_factory.mktemp("monterey") / "monterey.mcap"
-    words = ["import", "--pcap", str(recordings / "lidar/hdl32e_monterey.pcap"), "-o", str(path)]
-    assert main([*words, "--mavlink", str(recordings / "mavlink/copter_flight_2015.tlog")]) == 0
-    return path
 
 
 @pytest.fixture(scope="session")
