@@ -1,0 +1,47 @@
+"""`swath pull`: the flight logs of an aircraft, brought here, verified and acknowledged."""
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "bring the flight logs of an aircraft here, verified"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument(
+        "host", metavar="USER@HOST", help="the aircraft's computer; the user that install made is swath"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path(), metavar="DIR", help="folder for the logs (default: this one)"
+    )
+    parser.add_argument("--port", type=int, metavar="N", help="of its SSH server")
+    parser.add_argument("--identity", type=Path, metavar="FILE", help="the key")
+    parser.add_argument("--ssh-config", type=Path, metavar="FILE", help="configuration for ssh")
+    parser.add_argument(
+        "--anyway", action="store_true", help="go on where it is not known whether the aircraft is armed"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Pull; 0 when every closed segment is here and right, else 1."""
+    from groundproc.pull import Vehicle, pull
+
+    vehicle = Vehicle(arguments.host, arguments.port, arguments.identity, arguments.ssh_config)
+
+    def say(sentence: str) -> None:
+        print(sentence, file=sys.stderr)
+
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    quiet = not sys.stderr.isatty()
+    outcome = pull(vehicle, arguments.output, say, anyway=arguments.anyway, quiet=quiet)
+    for segment in outcome.brought:
+        print(arguments.output / segment.name)
+    for trouble in outcome.troubles:
+        say(f"swath: {trouble}")
+    size_mb = sum(segment.size for segment in outcome.brought) / 1e6
+    say(
+        f"{len(outcome.brought)} brought ({size_mb:.1f} MB), {len(outcome.here)} here already, "
+        f"{outcome.acknowledged} newly acknowledged, {len(outcome.troubles)} failed"
+    )
+    return int(bool(outcome.troubles))
