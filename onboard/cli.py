@@ -1,7 +1,7 @@
 """The command line of `swathd`."""
 
 import argparse
-import logging
+import faulthandler
 import os
 import sys
 import time
@@ -58,11 +58,10 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from onboard import config, daemon
+    from onboard import config, daemon, journal
 
-    # the journal has its own clock
-    style = "%(message)s" if "JOURNAL_STREAM" in os.environ else "%(asctime)s %(levelname)s %(message)s"
-    logging.basicConfig(level=logging.INFO, format=style, stream=sys.stderr)
+    faulthandler.enable()  # killed by the watchdog, it says where each thread was
+    journal.start()
     daemon.run(config.load(options.config), options.config)
     return 0
 
