@@ -7,6 +7,7 @@ Alignment counts from the byte after the 4-byte encapsulation header.
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -119,7 +120,33 @@ HOST_CLOCK: Final = RecordType(
     "steps inside a log, and realtime_ns minus the header's stamp says how far the wall clock has moved.",
 )
 
-TABLE: Final = (LIDAR, LIDAR_ACCOUNT, POSITION, MAVLINK, DATAFLASH, HOST_CLOCK)
+CLOCK_SYNC: Final = RecordType(
+    "/clock_sync",
+    "swath_msgs/msg/ClockSync",
+    _definition(
+        "std_msgs/Header header\n"
+        "# frame_id is whose clock: ins, fc (boot time of the autopilot of that link) or lidar (time past some hour)\n"
+        "# that clock minus log time at the header's stamp [ns]\n"
+        "int64 offset_ns\n"
+        "# how much faster than log time it runs [1e-6]; 0 until that is known\n"
+        "float64 skew_ppm\n"
+        "# half of the shortest round trip, or what the samples show; the delay of a one-way link is not in it [ns]\n"
+        "int64 uncertainty_ns\n"
+        "# UTC minus log time at the header's stamp, as utc_source has it; 0 without one [ns]\n"
+        "int64 utc_offset_ns\n"
+        "uint32 samples\n"
+        "# how often the clock jumped: the device was started again, or the lidar found its pulse\n"
+        "uint32 restarts\n"
+        "# 1 TIMESYNC, 2 envelope of (clock - receive time)\n"
+        "uint8 method\n"
+        "# 0 none, 1 SYSTEM_TIME, 2 GPRMC with a fix, 3 GPRMC without a fix\n"
+        "uint8 utc_source\n"
+    ),
+    "How a device's clock stood to log time, as known aboard at that moment: for health, and for a first look on the ground. "
+    "The raw stamps, receive times and TIMESYNC messages are in the other topics, and can be fitted better afterwards.",
+)
+
+TABLE: Final = (LIDAR, LIDAR_ACCOUNT, POSITION, MAVLINK, DATAFLASH, HOST_CLOCK, CLOCK_SYNC)
 """All record types, in the order of the documentation."""
 
 
@@ -343,3 +370,59 @@ def decode_host_clock(data: bytes | memoryview) -> HostClock:
     if offset + _HOST_CLOCK.size > len(data):
         raise LogError(f"{HOST_CLOCK.topic}: {len(data)} bytes, expected {offset + _HOST_CLOCK.size}")
     return HostClock(stamp_ns, *_HOST_CLOCK.unpack_from(data, offset))
+
+
+class SyncMethod(IntEnum):
+    """How a clock is tied to log time."""
+
+    TIMESYNC = 1
+    ENVELOPE = 2
+
+
+class UtcSource(IntEnum):
+    """Who says what UTC is."""
+
+    NONE = 0
+    SYSTEM_TIME = 1
+    RMC_FIX = 2
+    RMC_NO_FIX = 3
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSync:
+    """How a device's clock stands to log time; see the definition of /clock_sync."""
+
+    log_ns: int
+    clock: str
+    offset_ns: int
+    skew_ppm: float
+    uncertainty_ns: int
+    utc_offset_ns: int
+    samples: int
+    restarts: int
+    method: SyncMethod
+    utc_source: UtcSource = UtcSource.NONE
+
+
+_CLOCK_SYNC: Final = struct.Struct("<qdqqIIBB")
+
+
+def encode_clock_sync(sync: ClockSync) -> bytes:
+    """Encode a ClockSync; its log time is the stamp."""
+    head = _header(sync.log_ns, sync.clock)
+    head += _pad(len(head) - 4, 8)
+    values = [getattr(sync, field.name) for field in fields(sync)[2:]]
+    return head + _CLOCK_SYNC.pack(*values)
+
+
+def decode_clock_sync(data: bytes | memoryview) -> ClockSync:
+    """Decode a ClockSync; raises LogError for other bytes."""
+    stamp_ns, clock, offset = _open_header(data, CLOCK_SYNC.topic)
+    offset += -(offset - 4) % 8
+    if offset + _CLOCK_SYNC.size > len(data):
+        raise LogError(f"{CLOCK_SYNC.topic}: {len(data)} bytes, expected {offset + _CLOCK_SYNC.size}")
+    values = _CLOCK_SYNC.unpack_from(data, offset)
+    try:
+        return ClockSync(stamp_ns, clock, *values[:6], method=SyncMethod(values[6]), utc_source=UtcSource(values[7]))
+    except ValueError as error:
+        raise LogError(f"{CLOCK_SYNC.topic}: {error}") from None

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from flightlog import records
 from flightlog.errors import LogError
 from flightlog.hdl32e import DATA_DTYPE
-from flightlog.records import HostClock, LidarAccount, RecordType
+from flightlog.records import ClockSync, HostClock, LidarAccount, RecordType, SyncMethod, UtcSource
 
 S = 10**9
 Chunks = list[tuple[int, bytes]]
@@ -47,6 +47,11 @@ raw_chunks = st.lists(st.tuples(times, st.binary(max_size=40)), max_size=6)
 counts = st.integers(0, 2**32 - 1)
 accounts = st.builds(LidarAccount, *[counts] * 9, st.floats(0, 360, width=32), st.floats(0, 360, width=32))
 int64 = st.integers(-(2**63), 2**63 - 1)
+uint32 = st.integers(0, 2**32 - 1)
+clock_syncs = st.builds(
+    ClockSync, times, st.sampled_from(["ins", "fc", "lidar"]), int64, st.floats(-1e6, 1e6), int64, int64, uint32, uint32,
+    st.sampled_from(SyncMethod), st.sampled_from(UtcSource),
+)  # fmt: skip
 host_clocks = st.builds(HostClock, times, int64, int64, int64, int64)
 
 
@@ -117,6 +122,16 @@ def test_host_clocks_read_the_same_everywhere(decoder_of: Any, clock: HostClock)
     assert HostClock(stamp_ns(theirs), *values) == clock
 
 
+@witness
+@given(clock_syncs)
+def test_clock_syncs_read_the_same_everywhere(decoder_of: Any, sync: ClockSync) -> None:
+    data = records.encode_clock_sync(sync)
+    assert records.decode_clock_sync(data) == sync
+    theirs = cached(decoder_of, records.CLOCK_SYNC)(data)
+    names = list(ClockSync.__dataclass_fields__)[2:]
+    assert ClockSync(stamp_ns(theirs), theirs.header.frame_id, *(getattr(theirs, name) for name in names)) == sync
+
+
 _CACHE: dict[tuple[Any, str], Callable[[bytes], Any]] = {}
 
 
@@ -179,6 +194,10 @@ SAMPLES = {
     "raw": (records.encode_raw(1, [(2, b"abc"), (3, b""), (4, b"defgh")], "ins"), records.decode_raw),
     "position": (records.encode_raw(1, [(2, bytes(512))], "velodyne"), records.decode_position),
     "account": (records.encode_account(1, LidarAccount(5, 4, 1)), records.decode_account),
+    "clock sync": (
+        records.encode_clock_sync(ClockSync(1, "ins", 2, 3.0, 4, 5, 6, 7, SyncMethod.TIMESYNC)),
+        records.decode_clock_sync,
+    ),
     "host clock": (records.encode_host_clock(HostClock(1, 2, 3, 4, 5)), records.decode_host_clock),
 }
 
