@@ -10,7 +10,10 @@ datagrams    many datagrams of a socket in one system call, with the kernel's re
 lidar        the HDL-32E's two ports -> batches
 sources      the serial device or UDP port of a MAVLink link
 autopilot    MAVLink links -> raw chunks; asks for the streams
-recorder     bounded backlog -> segments of the flight log, synced to the disk twice a second
+recorder     bounded backlog -> segments of the flight log, synced to the disk twice a second; watches the space left
+segment      one file of the flight log, until it is read-only and in the manifest
+logfolder    names, manifest, space
+leftovers    logs that a power cut left open, mended beside the recording
 worker       a thread whose progress is watched
 notify       word to systemd
 daemon       start, run, stop

@@ -15,13 +15,15 @@ from flightlog import __version__, config, records
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mount import Mount, load_mount
-from onboard import health, notify
+from flightlog.records import HostClock
+from onboard import health, leftovers, logfolder, notify
 from onboard.autopilot import Link
 from onboard.config import SwathdConfig
 from onboard.health import RecorderStatus, Status
 from onboard.lidar import LidarPort
 from onboard.readings import LidarReadings, Rates, link_status
-from onboard.recorder import Recorder, Segment, next_segment_path, write_atomically
+from onboard.recorder import Recorder
+from onboard.segment import Segment
 from onboard.timesync import ClockWatch, LogTime, read_clocks
 from onboard.worker import Worker
 
@@ -66,7 +68,9 @@ class Daemon:
         self._recorder: Recorder | None = None
         self._lidar = LidarPort(settings.lidar, self._log_time, self._put)
         try:
-            self._recorder = Recorder(settings.recorder, self._open_segment(settings, mount))
+            keep_free_bytes = 2 * settings.recorder.min_free_mb << 20
+            self._salvager = leftovers.begin(self._directory, keep_free_bytes, settings.recorder.compression)
+            self._recorder = Recorder(settings.recorder, lambda: self._open_segment(settings, mount))
         except BaseException:
             self._lidar.close()
             raise
@@ -76,8 +80,10 @@ class Daemon:
         self._lidar_readings = LidarReadings(self._lidar, settings.lidar.interface)
 
     def _open_segment(self, settings: SwathdConfig, mount: Mount) -> Segment:
-        path = next_segment_path(self._directory, self._boot_id)
-        clock = self._clock_watch.record()
+        path = logfolder.next_segment_path(self._directory, self._boot_id)
+        now = read_clocks()
+        boottime_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        clock = HostClock(self._log_time.at(now), now.realtime_ns, now.monotonic_ns, boottime_ns)
         fov = settings.lidar.fov
         session = {
             "boot_id": self._boot_id,
@@ -97,6 +103,7 @@ class Daemon:
             attachments={"config.yaml": config.dump(settings).encode(), "mount.yaml": mount.yaml().encode()},
             topics=topics,
             first=(records.HOST_CLOCK.topic, clock.log_ns, records.encode_host_clock(clock)),
+            compression=settings.recorder.compression,
         )
 
     def _put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
@@ -121,17 +128,18 @@ class Daemon:
         sys.setswitchinterval(0.001)
         for worker in reversed(self._workers):
             worker.start()
+        self._salvager.start()
         _log.info("recording to %s", self._directory / self._segment_name)
         try:
             self._attend()
         finally:
             notify.stopping()
+            self._salvager.stop()
             for worker in self._workers:
                 worker.stop(_END_S)
         self._write_status(self._status())
         if failures := self._failures():
             raise SwathError("; ".join(failures))
-        _log.info("closed %s", self._directory / self._segment_name)
 
     @property
     def _segment_name(self) -> str:
@@ -178,7 +186,7 @@ class Daemon:
 
     def _write_status(self, status: Status) -> None:
         try:
-            write_atomically(self._status_path, health.to_json(status), sync=False)
+            logfolder.write_atomically(self._status_path, health.to_json(status), sync=False)
         except OSError as error:
             if not self._status_trouble:
                 _log.error("status file %s cannot be written (%s)", self._status_path, error.strerror)
@@ -209,7 +217,7 @@ class Daemon:
     def _recorder_status(self, now_ns: int) -> RecorderStatus:
         assert self._recorder is not None
         counts, backlog = self._recorder.counts, self._recorder.backlog
-        disk = os.statvfs(self._directory)
+        leftover = self._salvager.counts
         return RecorderStatus(
             segment=counts.segment,
             messages=counts.messages,
@@ -218,7 +226,14 @@ class Daemon:
             refused=backlog.refused,
             sync_age_s=(now_ns - counts.last_sync_ns) / NS_PER_S,
             slowest_sync_ms=counts.slowest_sync_ms,
-            free_bytes=disk.f_bavail * disk.f_frsize,
+            free_bytes=logfolder.free_bytes(self._directory),
+            segments=counts.segments,
+            space=counts.space.value,
+            refused_for_space=counts.refused_for_space,
+            lost_on_disk=counts.lost_on_disk,
+            leftovers=leftover.found,
+            leftovers_mended=leftover.mended,
+            leftovers_left=leftover.left,
         )
 
 

@@ -92,6 +92,19 @@ class RecorderStatus:
     sync_age_s: float = 0.0
     slowest_sync_ms: float = 0.0
     free_bytes: int = 0
+    segments: int = 0
+    """Opened since the start."""
+    space: str = "room"
+    """`room`, `low`: the lidar is not recorded, or `full`: nothing is."""
+    refused_for_space: int = 0
+    """Messages."""
+    lost_on_disk: int = 0
+    """Messages."""
+    leftovers: int = 0
+    """Logs that a power cut or a crash had left open, found at the start."""
+    leftovers_mended: int = 0
+    leftovers_left: int = 0
+    """Those that are no logs, or for which there was no space."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +226,19 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
     return []
 
 
+_SPACE: Final = {
+    "low": "space is low, so the lidar is not recorded; pull the logs, or delete what is not needed",
+    "full": "the disk is full and nothing is recorded; pull the logs, or delete what is not needed",
+}
+
+
 def _judge_recorder(recorder: RecorderStatus) -> list[tuple[Level, str]]:
+    if recorder.space in _SPACE:
+        return [(Level.CRITICAL, f"recorder: {_SPACE[recorder.space]}")]
     if recorder.sync_age_s > STALLED_NS / NS_PER_S:
         return [(Level.CRITICAL, f"recorder: nothing reached the disk for {recorder.sync_age_s:.0f} s")]
+    if recorder.lost_on_disk:
+        return [(Level.WARNING, f"recorder: {recorder.lost_on_disk} messages lost on a full disk")]
     return []
 
 

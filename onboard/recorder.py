@@ -1,23 +1,26 @@
-"""The flight log's writer: a bounded backlog that never makes a receiver wait, and segments synced to the disk twice a second."""
+"""The flight log's writer: a bounded backlog that never makes a receiver wait, and segments synced to the disk twice a second.
 
-import contextlib
-import json
+It watches the space that is left. Below a floor the lidar is refused and the rest goes on; below a quarter of that the log is closed
+well and everything is refused, until there is room again.
+"""
+
+import errno
 import logging
-import os
-import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from flightlog import __version__
+from flightlog import records
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
-from flightlog.logfile import LogWriter
+from onboard import logfolder
 from onboard.config import RecorderConfig
+from onboard.logfolder import Space
+from onboard.segment import Segment
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -30,6 +33,11 @@ _SLICE_NS: Final = 100 * NS_PER_MS
 """Writing goes on for at least this long between two syncs, however late the last one was."""
 _PRESSING: Final = 4
 """The backlog presses when it has grown to this part of its limit."""
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+_RETRY_NS: Final = 5 * NS_PER_S
+"""Between two attempts to open a segment on a full disk."""
+_LIDAR: Final = frozenset((records.LIDAR.topic, records.POSITION.topic))
+"""What is not recorded when space is low."""
 
 
 class _Item(NamedTuple):
@@ -88,106 +96,70 @@ class RecorderCounts:
     last_sync_ns: int = 0
     """Monotonic clock at the end of the last sync [ns]."""
     slowest_sync_ms: float = 0.0
-
-
-class Segment:
-    """One file of the flight log, from its first synced byte to its footer.
-
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-    metadata, attachments
-        See LogWriter.
-    topics : iterable of str
-        Announced at the head of the file: without them nothing that follows could be read.
-    first : tuple of topic, log time, bytes
-        A message to begin with, because a chunk without one is not written.
-
-    Raises
-    ------
-    LogError
-        The file cannot be made.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        metadata: Mapping[str, Mapping[str, str]],
-        attachments: Mapping[str, bytes],
-        topics: Iterable[str],
-        first: tuple[str, int, bytes],
-    ) -> None:
-        self.path = path
-        try:
-            self._file = path.open("xb")
-        except OSError as error:
-            raise LogError(f"{path}: cannot be written ({error.strerror})") from None
-        self._writer = LogWriter(
-            self._file, metadata=metadata, attachments=attachments, library=f"swathd {__version__}"
-        )
-        for topic in topics:
-            self._writer.add_topic(topic)
-        self.write(*first)
-        self.sync()
-        sync_directory(path.parent)
-
-    def write(self, topic: str, log_time_ns: int, data: bytes) -> None:
-        """Append one message."""
-        self._writer.write(topic, log_time_ns, data)
-
-    def sync(self) -> int:
-        """Force everything on to the disk; gives the file's size [bytes]."""
-        self._writer.flush()
-        os.fdatasync(self._file.fileno())
-        return self._file.tell()
-
-    def close(self) -> None:
-        """Write the footer, sync, close."""
-        try:
-            self._writer.finish()
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        finally:
-            self._file.close()
-        sync_directory(self.path.parent)
+    segments: int = 0
+    """Opened since the start."""
+    space: Space = Space.ROOM
+    refused_for_space: int = 0
+    """Messages that were not taken because space was low or out."""
+    lost_on_disk: int = 0
+    """Messages that were taken, and then the disk was full."""
 
 
 class Recorder(Worker):
-    """Writes the backlog to the segment.
+    """Writes the backlog to segments, one after the other.
 
     Parameters
     ----------
     config : RecorderConfig
-    segment : Segment
-        Open; closed when the recorder stops.
+    open_segment : callable
+        Opens the next segment; LogError, with an OSError as its cause, where that is not possible.
+
+    Raises
+    ------
+    LogError
+        The first segment cannot be opened, for another reason than a full disk.
     """
 
-    def __init__(self, config: RecorderConfig, segment: Segment) -> None:
+    def __init__(self, config: RecorderConfig, open_segment: Callable[[], Segment]) -> None:
         super().__init__("recorder")
-        self._segment = segment
+        self._config, self._open_segment = config, open_segment
+        self._directory = Path(config.directory)
         self._sync_ns = config.sync_ms * NS_PER_MS
+        self._floor_bytes = config.min_free_mb << 20
+        self._rotation_asked = threading.Event()
+        self._retry_ns = 0
+        self._told_drops = 0
+        self._segment: Segment | None = None
         self.backlog = Backlog(config.backlog_mb << 20)
-        self.counts = RecorderCounts(segment=segment.path.name, last_sync_ns=time.monotonic_ns())
+        self.counts = RecorderCounts(last_sync_ns=time.monotonic_ns())
+        self._look_at_space()
+        self._begin_segment()
 
     def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
         """Hand over one message; False, at once, if there is no room for it."""
+        space = self.counts.space
+        if space is Space.FULL or (space is Space.LOW and topic in _LIDAR):
+            self.counts.refused_for_space += 1
+            return False
         return self.backlog.put(topic, log_time_ns, data, vital)
+
+    def rotate(self) -> None:
+        """Ask for a new segment; soon, and not a message is lost for it."""
+        self._rotation_asked.set()
 
     def work(self) -> None:
         """Write and sync until asked to stop; what is in the backlog then is still written."""
         try:
             while not self.stopping:
-                self._write_until(self.counts.last_sync_ns + self._sync_ns)
-                if time.monotonic_ns() >= self.counts.last_sync_ns + self._sync_ns:
-                    self._sync()
+                self._go_round()
                 self.progress()
                 left_ns = self.counts.last_sync_ns + self._sync_ns - time.monotonic_ns()
                 self.backlog.pressing.wait(max(0.0, left_ns / NS_PER_S))
                 self.backlog.pressing.clear()
-            self._write_until(None)
+            self._until_full(lambda: self._write_until(None))
         finally:
-            self._segment.close()
+            self._close_segment()
+            logfolder.release_reserve(self._directory)
 
     def stop(self, timeout_s: float = 10.0) -> None:
         """Ask it to end and wait for that."""
@@ -195,10 +167,26 @@ class Recorder(Worker):
         self.backlog.pressing.set()
         super().stop(timeout_s)
 
+    def _go_round(self) -> None:
+        due_ns = self.counts.last_sync_ns + self._sync_ns
+        self._until_full(lambda: self._write_until(due_ns))
+        if time.monotonic_ns() < due_ns:
+            return
+        self._until_full(self._sync)
+        self._look_at_space()
+        if self.counts.space is Space.FULL:
+            self._close_segment()
+        elif self._segment is None or self._rotation_due(self._segment):
+            self._close_segment()
+            self._begin_segment()
+
     def _write_until(self, end_ns: int | None) -> None:
         """Write the backlog; not beyond a time of the monotonic clock [ns] even if more and more comes."""
         begin_ns = time.monotonic_ns()
         while (item := self.backlog.get()) is not None:
+            if self._segment is None:
+                self.counts.lost_on_disk += 1
+                continue
             self._segment.write(item.topic, item.log_time_ns, item.data)
             self.counts.messages += 1
             if end_ns is not None and time.monotonic_ns() >= max(end_ns, begin_ns + _SLICE_NS):
@@ -206,67 +194,93 @@ class Recorder(Worker):
 
     def _sync(self) -> None:
         begin_ns = time.monotonic_ns()
-        self.counts.bytes_on_disk = self._segment.sync()
+        if self._segment is not None:
+            self.counts.bytes_on_disk = self._segment.sync()
+            self.counts.syncs += 1
         self.counts.last_sync_ns = time.monotonic_ns()
-        self.counts.syncs += 1
         took_ms = (self.counts.last_sync_ns - begin_ns) / NS_PER_MS
         self.counts.slowest_sync_ms = max(self.counts.slowest_sync_ms, took_ms)
 
+    # Segments -----------------------------------------------------------------------------------------------------
 
-# Names ----------------------------------------------------------------------------------------------------------------
+    def _rotation_due(self, segment: Segment) -> bool:
+        large = segment.size >= self._config.segment_mb << 20
+        return large or segment.age_s >= self._config.segment_s or self._rotation_asked.is_set()
 
-_NAME: Final = re.compile(r"(\d{5})-(\d{3})\.mcap")
+    def _begin_segment(self) -> None:
+        """Open the next segment, unless the disk is full."""
+        if self.counts.space is Space.FULL or time.monotonic_ns() < self._retry_ns:
+            return
+        self._rotation_asked.clear()
+        try:
+            self._segment = self._open_segment()
+        except LogError as error:
+            if not isinstance(error.__cause__, OSError) or error.__cause__.errno not in _FULL:
+                raise
+            self._stop_for_space()
+            return
+        logfolder.hold_reserve(self._directory)
+        self.counts.segment = self._segment.path.name
+        self.counts.segments += 1
+        self._told_drops = self._drops()
+
+    def _close_segment(self) -> None:
+        segment, self._segment = self._segment, None
+        if segment is None:
+            return
+        try:
+            segment.close({"refused": self._drops() - self._told_drops})
+            _log.info("closed %s", segment.path)
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            _log.error("%s could not be closed on a full disk; the next start mends it", segment.path)
+        finally:
+            self.counts.lost_on_disk += segment.lost
+
+    def _drops(self) -> int:
+        return self.backlog.refused + self.counts.refused_for_space
+
+    # Space --------------------------------------------------------------------------------------------------------
+
+    def _until_full(self, step: Callable[[], None]) -> None:
+        """Do something that writes; a full disk closes the segment and ends nothing else."""
+        try:
+            step()
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            self._stop_for_space()
+
+    def _stop_for_space(self) -> None:
+        """The disk is full, whatever it said before."""
+        self._set_space(Space.FULL)
+        self._retry_ns = time.monotonic_ns() + _RETRY_NS
+        self.counts.last_sync_ns = time.monotonic_ns()
+        self._close_segment()
+
+    def _look_at_space(self) -> None:
+        if time.monotonic_ns() < self._retry_ns:
+            return
+        if self._judge() is not Space.ROOM and self._config.prune_acknowledged:
+            logfolder.prune(self._directory, lambda: self._judge() is Space.ROOM)
+        self._set_space(self._judge())
+
+    def _judge(self) -> Space:
+        try:
+            free_bytes = logfolder.free_bytes(self._directory)
+        except (FileNotFoundError, NotADirectoryError):  # it is made with the first segment
+            return Space.ROOM
+        return logfolder.space(free_bytes, self._floor_bytes, self.counts.space)
+
+    def _set_space(self, space: Space) -> None:
+        if space is not self.counts.space:
+            _log.log(*_SPACE_NEWS[space])
+        self.counts.space = space
 
 
-def next_segment_path(directory: Path, boot_id: str) -> Path:
-    """Path of the next segment: boot counter and a number within the boot, because dates cannot be trusted aboard.
-
-    The counter outlives the logs in `boot.json` of the folder.
-
-    Raises
-    ------
-    LogError
-        The folder cannot be made or written to.
-    """
-    state = directory / "boot.json"
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        taken = [(int(match[1]), int(match[2])) for p in directory.iterdir() if (match := _NAME.fullmatch(p.name))]
-        last_id, last = _last_boot(state)
-        newest = max([last, *(boot for boot, _ in taken)])
-        boot = last if boot_id == last_id and last == newest else newest + 1
-        write_atomically(state, json.dumps({"boot_id": boot_id, "number": boot}))
-    except OSError as error:
-        raise LogError(f"{directory}: logs cannot be written there ({error.strerror})") from None
-    segment = 1 + max((number for of_boot, number in taken if of_boot == boot), default=-1)
-    return directory / f"{boot:05d}-{segment:03d}.mcap"
-
-
-def _last_boot(state: Path) -> tuple[str, int]:
-    with contextlib.suppress(FileNotFoundError, ValueError, KeyError, TypeError):
-        tree = json.loads(state.read_text(encoding="utf-8"))
-        return str(tree["boot_id"]), int(tree["number"])
-    return "", 0
-
-
-def write_atomically(path: Path, text: str, *, sync: bool = True) -> None:
-    """Replace a file so that a reader, or a power cut, finds the old text or the new one."""
-    temporary = path.with_name(f".{path.name}.new")
-    with temporary.open("w", encoding="utf-8") as file:
-        os.fchmod(file.fileno(), 0o644)  # whoever may enter the folder may read it, whatever the umask
-        file.write(text)
-        if sync:
-            file.flush()
-            os.fsync(file.fileno())
-    temporary.replace(path)
-    if sync:
-        sync_directory(path.parent)
-
-
-def sync_directory(directory: Path) -> None:
-    """Force the names in a folder on to the disk."""
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+_SPACE_NEWS: Final = {
+    Space.ROOM: (logging.WARNING, "there is room on the disk again: everything is recorded"),
+    Space.LOW: (logging.ERROR, "space on the disk is low: the lidar is not recorded any more"),
+    Space.FULL: (logging.CRITICAL, "the disk is full: the log is closed, nothing is recorded any more"),
+}
