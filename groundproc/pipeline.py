@@ -17,7 +17,7 @@ import numpy.typing as npt
 from flightlog import FORMAT_VERSION, __version__, config
 from flightlog.clock import utc_text
 from flightlog.constants import HOUR_NS
-from flightlog.errors import CoverageError, UsageError
+from flightlog.errors import CoverageError, LogError, UsageError
 from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
@@ -112,25 +112,41 @@ def check_order(readers: list[LogReader]) -> None:
 
 
 def fly(timeline: Sequence[Leg], survey: Survey, mount: Mount) -> Trajectory:
-    """The trajectory of all legs, in the local frame of the first fix."""
+    """The trajectory of all legs, in the local frame of the first fix; a boot that never had one leaves a gap.
+
+    Raises
+    ------
+    LogError
+        No boot gives a trajectory, or its heights are not of the kind asked for.
+    """
+    # where none has a fix, the first boot says what is missing
+    placed = [leg for leg in timeline if ins.has_position(leg.boot)] or list(timeline[:1])
     undulation_m = None
     if survey.geoid is not None:
-        place = ins.position_fixes(timeline[0].boot, "msl")
+        place = ins.position_fixes(placed[0].boot, "msl")
         undulation_m = geodesy.undulation(survey.geoid, float(place.latitude_deg[0]), float(place.longitude_deg[0]))
-    fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in timeline]
+    fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in placed]
     first = fixes[0]
     frame = geodesy.LocalFrame(float(first.latitude_deg[0]), float(first.longitude_deg[0]), float(first.height_m[0]))
     grid_ns = None if survey.pose_grid_ms is None else round(survey.pose_grid_ms * 1e6)
     parts: list[Trajectory] = []
-    for number, (leg, fix) in enumerate(zip(timeline, fixes, strict=True)):
-        part = ins.ins_trajectory(leg.boot, fix, frame, leg.utc_from_boot, mount, grid_ns)
+    reasons: list[LogError] = []
+    for number, (leg, fix) in enumerate(zip(placed, fixes, strict=True)):
+        try:
+            part = ins.ins_trajectory(leg.boot, fix, frame, leg.utc_from_boot, mount, grid_ns)
+        except LogError as error:
+            reasons.append(error)
+            continue
         # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
-        if number and timeline[number - 1].boot is leg.boot:
-            part = part.after(parts[-1].time_ns[-1])
-        if number + 1 < len(timeline) and timeline[number + 1].boot is leg.boot:
+        if number and placed[number - 1].boot is leg.boot and parts:
+            part = part.after(int(parts[-1].time_ns[-1]))
+        if number + 1 < len(placed) and placed[number + 1].boot is leg.boot:
             part = part.before(int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]))
-        parts.append(part)
-    return joined([part for part in parts if len(part) > 1])
+        if len(part) > 1:
+            parts.append(part)
+    if reasons and not parts:
+        raise reasons[0]
+    return joined(parts)
 
 
 # Points ---------------------------------------------------------------------------------------------------------------
@@ -329,7 +345,8 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
     return {
         "boot": leg.boot.number,
         "lidar_run": leg.run,
-        "attitude_from": ins.attitudes(leg.boot)[0],
+        "attitude_from": ins.attitude_source(leg.boot),
+        "position_from": ins.position_source(leg.boot),
         "utc": {"source": leg.utc.source, "sigma_s": leg.utc.sigma_ns * 1e-9},
         "sync": describe_sync(leg),
     }

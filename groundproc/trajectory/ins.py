@@ -100,9 +100,35 @@ def position_fixes(boot: Boot, height: str, undulation_m: float | None = None) -
     return replace(fixes, height_m=fixes.height_m + undulation_m)
 
 
+def position_source(boot: Boot) -> str | None:
+    """The message that positions of a boot come from; None where there is none or it never had a fix."""
+    for name in ("GLOBAL_POSITION_INT", "GPS_RAW_INT"):
+        if boot.has(name):
+            return name if _known_positions(boot, name).any() else None
+    return None
+
+
+def has_position(boot: Boot) -> bool:
+    """Whether a boot ever knew where it is."""
+    return position_source(boot) is not None
+
+
+def _known_positions(boot: Boot, name: str) -> npt.NDArray[np.bool_]:
+    """Which rows of a message hold a position: it is zero until the first fix."""
+    table = boot.tables[name]
+    if name == "GPS_RAW_INT":
+        return np.asarray(table["fix_type"] >= 3)
+    return np.asarray((table["lat"] != 0) | (table["lon"] != 0))
+
+
+def attitude_source(boot: Boot) -> str | None:
+    """The message that attitudes of a boot come from."""
+    return next((name for name in ("ATTITUDE", "ATTITUDE_QUATERNION", "AHRS2") if boot.has(name)), None)
+
+
 def _global_positions(boot: Boot, height: str) -> PositionFixes:
     table, time_ns = boot.tables["GLOBAL_POSITION_INT"], boot.stamps_ns["GLOBAL_POSITION_INT"]
-    known = (table["lat"] != 0) | (table["lon"] != 0)  # zero until the first fix
+    known = _known_positions(boot, "GLOBAL_POSITION_INT")
     if not known.any():
         raise LogError("MAVLink: GLOBAL_POSITION_INT holds no position; the autopilot never had a fix")
     table, time_ns = table[known], time_ns[known]
@@ -125,7 +151,7 @@ def _gps_positions(boot: Boot, height: str) -> PositionFixes:
             "MAVLink: GPS_RAW_INT has no height above home; GLOBAL_POSITION_INT is needed for relative heights"
         )
     table, time_ns = boot.tables["GPS_RAW_INT"], boot.stamps_ns["GPS_RAW_INT"]
-    known = table["fix_type"] >= 3
+    known = _known_positions(boot, "GPS_RAW_INT")
     if not known.any():
         raise LogError("MAVLink: GPS_RAW_INT never has a 3D fix")
     table, time_ns = table[known], time_ns[known]

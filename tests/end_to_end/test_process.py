@@ -13,8 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scipy.spatial.transform import Rotation, Slerp
 
+from flightlog import records
 from flightlog.logfile import LogReader, LogWriter
 from groundproc.cli import main
 
@@ -397,6 +399,44 @@ def test_a_reboot_in_flight_leaves_a_gap_and_no_step(rebooted_flight: Any, tmp_p
     assert (cloud_s < start_s).any()
     assert (cloud_s > end_s).any()
     assert quality["points"]["shots_dropped"]["no_pose"] > 0
+
+
+def test_a_boot_that_never_had_a_fix_leaves_a_gap(
+    rebooted_flight: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the reboot all places are zero, as on the bench without GPS; without the second boot nothing is left to fly by."""
+    log, first_only = tmp_path / "cold.mcap", tmp_path / "first.mcap"
+    sender = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    boot_ms = 10**9
+
+    def cold(data: bytes) -> bytes:
+        nonlocal boot_ms
+        message = dialect.MAVLink(None).decode(bytearray(data))
+        if message.get_type() == "ATTITUDE":
+            boot_ms = message.time_boot_ms
+        if boot_ms > 60_000 and message.get_type() == "GLOBAL_POSITION_INT":
+            message.lat = message.lon = 0
+        return bytes(message.pack(sender))
+
+    with LogReader(rebooted_flight.log) as reader, log.open("wb") as stream, first_only.open("wb") as other:
+        writers = [LogWriter(f, metadata={}, attachments=dict(reader.attachments)) for f in (stream, other)]
+        reboot_ns = reader.start_ns + round(rebooted_flight.truth["reboot_s"][0] * 1e9)
+        for message in reader.messages():
+            data = bytes(message.data)
+            if "mavlink" in message.topic:
+                chunks = [(t, cold(chunk)) for t, chunk in records.decode_raw(data)]
+                data = records.encode_raw(message.log_time_ns, chunks, "ins")
+            for writer in writers[: 2 if message.log_time_ns < reboot_ns else 1]:
+                writer.write(message.topic, message.log_time_ns, data)
+        for writer in writers:
+            writer.finish()
+    made = process(tmp_path / "out", log)
+    assert [leg["position_from"] for leg in made.quality["legs"]] == [None, "GLOBAL_POSITION_INT"]
+    assert [leg["attitude_from"] for leg in made.quality["legs"]] == ["ATTITUDE", "ATTITUDE"]
+    when = (made.trajectory["utc_ns"] - rebooted_flight.truth["clocks"]["utc"]["start_ns"]) * 1e-9
+    assert when.min() > rebooted_flight.truth["reboot_s"][1] - 0.1
+    assert made.quality["points"]["shots_dropped"]["no_pose"] > 100_000
+    assert "never had a fix" in refused(capsys, tmp_path / "not", first_only)
 
 
 def test_a_log_that_a_power_cut_ended_is_processed_as_far_as_it_goes(gps_flight: Any, tmp_path: Path) -> None:
