@@ -5,7 +5,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Final
 
-from flightlog import config
+from flightlog import config, records
 from flightlog.config import option
 from flightlog.hdl32e import DATA_PORT, POSITION_PORT
 
@@ -123,6 +123,39 @@ class RecorderConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DownlinkConfig:
+    """What goes to the ground live, as UDP; it never harms the recording."""
+
+    address: str | None = option(None, "IP address on the ground, a broadcast address too; null: there is no downlink")
+    lidar_port: int = option(DATA_PORT, "port of the data packets there", minimum=1, maximum=65535)
+    position_port: int = option(POSITION_PORT, "port of the position packets there", minimum=1, maximum=65535)
+    mavlink_port: int = option(14550, "port of the ground station there", minimum=1, maximum=65535)
+    mavlink: str = option("ins", "whose bytes go there", choices=("ins", "fc", "none"))
+    thin: int = option(
+        1, "send one sector of 10 deg in so many, others in each turn: that many turns make a whole scan",
+        minimum=1, maximum=36,
+    )  # fmt: skip
+    rate_kbit_s: int = option(
+        20_000, "never send more; the whole sensor is 18,400, in dual return mode 36,800 [kbit/s]",
+        minimum=64, maximum=1_000_000,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        if self.address is not None:
+            try:
+                IPv4Address(self.address)
+            except ValueError:
+                raise ValueError(f"address {self.address!r} found, expected one such as 10.0.0.2") from None
+
+    def ports(self) -> dict[str, int]:
+        """Port of each topic that goes down."""
+        ports = {records.LIDAR.topic: self.lidar_port, records.POSITION.topic: self.position_port}
+        if self.mavlink != "none":
+            ports[records.MAVLINK.topic + self.mavlink] = self.mavlink_port
+        return ports
+
+
+@dataclass(frozen=True, slots=True)
 class SwathdConfig:
     """Everything `swathd run` needs to know."""
 
@@ -136,6 +169,7 @@ class SwathdConfig:
         metadata={"about": "MAVLink of the board that flies, where it is another one; topic /mavlink/fc"},
     )
     recorder: RecorderConfig = option(RecorderConfig, "flight logs")
+    downlink: DownlinkConfig = option(DownlinkConfig, "live view on the ground")
     mount: str | None = option(
         None, "mount file that goes into every log, relative to this file; null: the nominal mount"
     )

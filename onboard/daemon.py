@@ -23,6 +23,7 @@ from onboard.health import RecorderStatus, Status
 from onboard.lidar import LidarPort
 from onboard.readings import LidarReadings, Rates, link_status
 from onboard.recorder import Recorder
+from onboard.relay import Relay
 from onboard.segment import Segment
 from onboard.timesync import ClockWatch, LogTime, read_clocks
 from onboard.worker import Worker
@@ -63,6 +64,7 @@ class Daemon:
         self._stop = stop
         self._status_trouble = False
         self._links: dict[str, Link] = {}
+        self._relay: Relay | None = None
 
         # The ports first: packets wait in their buffers while the log is opened.
         self._recorder: Recorder | None = None
@@ -74,6 +76,7 @@ class Daemon:
         except BaseException:
             self._lidar.close()
             raise
+        self._relay = None if settings.downlink.address is None else Relay(settings.downlink)
         for name, link in settings.links().items():
             self._links[name] = Link(name, link, self._log_time, self._put)
         self._rates = Rates()
@@ -108,6 +111,8 @@ class Daemon:
 
     def _put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
         assert self._recorder is not None
+        if self._relay is not None:
+            self._relay.offer(topic, data)
         return self._recorder.put(topic, log_time_ns, data, vital)
 
     @property
@@ -129,6 +134,8 @@ class Daemon:
         for worker in reversed(self._workers):
             worker.start()
         self._salvager.start()
+        if self._relay is not None:  # none of the workers: nothing of the recording depends on it
+            self._relay.start()
         _log.info("recording to %s", self._directory / self._segment_name)
         try:
             self._attend()
@@ -137,6 +144,8 @@ class Daemon:
             self._salvager.stop()
             for worker in self._workers:
                 worker.stop(_END_S)
+            if self._relay is not None:
+                self._relay.stop()
         self._write_status(self._status())
         if failures := self._failures():
             raise SwathError("; ".join(failures))
@@ -212,6 +221,7 @@ class Daemon:
             },
             recorder=self._recorder_status(now.monotonic_ns),
             failures=self._failures(),
+            downlink=None if self._relay is None else self._relay.status(self._rates.per_second),
         )
 
     def _recorder_status(self, now_ns: int) -> RecorderStatus:

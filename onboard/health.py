@@ -108,6 +108,22 @@ class RecorderStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class DownlinkStatus:
+    """What goes to the ground live; totals since the start, rates over the last second."""
+
+    address: str
+    sent_s: float = 0.0
+    kbit_s: float = 0.0
+    sent: int = 0
+    thinned: int = 0
+    dropped: int = 0
+    """Datagrams for which the link, or the cap on its rate, was too slow."""
+    unheard: int = 0
+    """Datagrams that the ground refused: no program has the port."""
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Status:
     """Everything; what the status file holds."""
 
@@ -122,6 +138,7 @@ class Status:
     links: dict[str, LinkStatus]
     recorder: RecorderStatus
     failures: list[str] = field(default_factory=list)
+    downlink: DownlinkStatus | None = None
 
 
 def to_json(status: Status) -> str:
@@ -136,6 +153,7 @@ def from_json(text: str, place: str) -> Status:
         tree["lidar"] = LidarStatus(**tree["lidar"] | {"state": State(tree["lidar"]["state"])})
         tree["links"] = {name: LinkStatus(**link) for name, link in tree["links"].items()}
         tree["recorder"] = RecorderStatus(**tree["recorder"])
+        tree["downlink"] = None if tree["downlink"] is None else DownlinkStatus(**tree["downlink"])
         return Status(**tree)
     except (ValueError, KeyError, TypeError, AttributeError):
         raise SwathError(f"{place}: is no status file of this version of swathd") from None
@@ -179,6 +197,8 @@ def judge(status: Status, now_ns: int, boot_id: str) -> Verdict:
     for name, link in status.links.items():
         found += _judge_link(name, link)
     found += _judge_recorder(status.recorder)
+    if status.downlink is not None and status.downlink.trouble:
+        found.append((Level.WARNING, f"downlink: {status.downlink.trouble}; recording goes on"))
     return Verdict(max((level for level, _ in found), default=Level.GOOD), [text for _, text in found])
 
 
@@ -273,4 +293,9 @@ def report(status: Status, verdict: Verdict) -> list[str]:
         f"{recorder.sync_age_s:.1f} s ago, slowest {recorder.slowest_sync_ms:.0f} ms, "
         f"{recorder.free_bytes / 1e9:.1f} GB free"
     )
+    if (downlink := status.downlink) is not None:
+        lines.append(
+            f"downlink  {downlink.sent_s:.0f} datagrams/s, {downlink.kbit_s:.0f} kbit/s to {downlink.address}, "
+            f"{downlink.dropped} dropped, {downlink.unheard} refused there"
+        )
     return lines
