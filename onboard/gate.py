@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from flightlog.errors import LogError, UsageError
+from onboard import logfolder
 
-MANIFEST: Final = "manifest.jsonl"
-ACKNOWLEDGED: Final = "acknowledged.jsonl"
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _WRITABLE: Final = 0o222
 _MAX_WORDS: Final = 2000
@@ -59,11 +58,15 @@ def manifest(directory: Path) -> list[dict[str, Any]]:
     LogError
         The folder cannot be read.
     """
-    known = {line["sha256"] for line in _lines(directory / ACKNOWLEDGED)}
+    try:
+        safe = logfolder.acknowledged(directory)
+        lines = logfolder.read_manifest(directory)
+    except OSError as error:
+        raise LogError(f"{directory}: cannot be read ({error.strerror})") from None
     return [
-        {**line, "acknowledged": line["sha256"] in known}
-        for line in _lines(directory / MANIFEST)
-        if _closed(directory / Path(str(line.get("file"))).name)
+        {**line, "acknowledged": line["sha256"] in safe}
+        for name, line in lines.items()
+        if "sha256" in line and _closed(directory / Path(name).name)
     ]
 
 
@@ -85,14 +88,14 @@ def acknowledge(directory: Path, sums: tuple[str, ...]) -> int:
     LogError
         It cannot be noted.
     """
-    files = {line["sha256"]: line.get("file") for line in _lines(directory / MANIFEST)}
+    files = {line["sha256"]: name for name, line in logfolder.read_manifest(directory).items() if "sha256" in line}
     if unknown := [one for one in sums if one not in files]:
         raise RefusedError(f"ack {unknown[0]}: no segment of the manifest has this sum")
-    path = directory / ACKNOWLEDGED
+    path = directory / logfolder.ACKNOWLEDGED
     try:
         with path.open("a", encoding="utf-8") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            known = {line["sha256"] for line in _lines(path)}
+            known = logfolder.acknowledged(directory)
             new = [one for one in dict.fromkeys(sums) if one not in known]
             file.writelines(json.dumps({"file": files[one], "sha256": one}) + "\n" for one in new)
             file.flush()
@@ -100,22 +103,3 @@ def acknowledge(directory: Path, sums: tuple[str, ...]) -> int:
     except OSError as error:
         raise LogError(f"{path}: cannot be written ({error.strerror})") from None
     return len(new)
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """Objects of a file of JSON lines that have a sum; a line that a power cut tore is passed over."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror})") from None
-    found = []
-    for line in text.splitlines():
-        try:
-            tree = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(tree, dict) and isinstance(tree.get("sha256"), str):
-            found.append(tree)
-    return found

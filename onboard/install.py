@@ -158,7 +158,10 @@ def _chosen(place: Place, interface: str | None) -> dict[str, Path]:
 
 def _bring_up(root: Path, network: bool, start: bool) -> list[str]:
     if root != Path("/"):
+        _call("systemd-sysusers", f"--root={root}", str(root / _FILES["sysusers.conf"]))
         _call("systemctl", f"--root={root}", "enable", "swathd.service")
+        if network:
+            _try("systemctl", f"--root={root}", "enable", "systemd-networkd.service")
         return ["enabled swathd.service: it starts when that system boots"]
     _call("systemd-sysusers", "/etc/sysusers.d/swathd.conf")
     _call("systemd-tmpfiles", "--create", "/etc/tmpfiles.d/swathd.conf")

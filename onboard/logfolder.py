@@ -65,6 +65,7 @@ def write_atomically(path: Path, text: str, *, sync: bool = True) -> None:
     """Replace a file so that a reader, or a power cut, finds the old text or the new one."""
     temporary = path.with_name(f".{path.name}.new")
     with temporary.open("w", encoding="utf-8") as file:
+        os.fchmod(file.fileno(), 0o644)  # whoever may enter the folder may read it, whatever the umask
         file.write(text)
         if sync:
             file.flush()

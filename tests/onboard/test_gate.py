@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from onboard import cli, gate
 from onboard.gate import RefusedError, Wish, wish
+from onboard.logfolder import ACKNOWLEDGED, MANIFEST
 
 SUM = hashlib.sha256(b"one").hexdigest()
 
@@ -54,7 +55,7 @@ def put(folder: Path, name: str, data: bytes, mode: int = 0o440) -> str:
     (folder / name).write_bytes(data)
     (folder / name).chmod(mode)
     line = {"file": name, "size": len(data), "sha256": hashlib.sha256(data).hexdigest(), "messages": 7}
-    with (folder / gate.MANIFEST).open("a") as file:
+    with (folder / MANIFEST).open("a") as file:
         file.write(json.dumps(line) + "\n")
     return str(line["sha256"])
 
@@ -65,7 +66,7 @@ def test_the_manifest_shows_what_is_here_closed_and_who_has_it(tmp_path: Path) -
     put(tmp_path, "00001-002.mcap", b"open", mode=0o640)
     put(tmp_path, "00001-003.mcap", b"pruned")
     (tmp_path / "00001-003.mcap").unlink()
-    with (tmp_path / gate.MANIFEST).open("a") as file:
+    with (tmp_path / MANIFEST).open("a") as file:
         file.write('{"file": "00001-004.mca')  # the power went
     assert gate.acknowledge(tmp_path, (first,)) == 1
     found = gate.manifest(tmp_path)
@@ -80,7 +81,7 @@ def test_acknowledged_once_and_only_what_the_manifest_has(tmp_path: Path) -> Non
     assert gate.acknowledge(tmp_path, (second, first)) == 1
     with pytest.raises(RefusedError, match="no segment"):
         gate.acknowledge(tmp_path, ("0" * 64,))
-    lines = [json.loads(line) for line in (tmp_path / gate.ACKNOWLEDGED).read_text().splitlines()]
+    lines = [json.loads(line) for line in (tmp_path / ACKNOWLEDGED).read_text().splitlines()]
     assert lines == [{"file": "00001-000.mcap", "sha256": first}, {"file": "00001-001.mcap", "sha256": second}]
 
 
