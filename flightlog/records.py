@@ -421,8 +421,9 @@ def decode_clock_sync(data: bytes | memoryview) -> ClockSync:
     offset += -(offset - 4) % 8
     if offset + _CLOCK_SYNC.size > len(data):
         raise LogError(f"{CLOCK_SYNC.topic}: {len(data)} bytes, expected {offset + _CLOCK_SYNC.size}")
-    values = _CLOCK_SYNC.unpack_from(data, offset)
+    *values, method, source = _CLOCK_SYNC.unpack_from(data, offset)
     try:
-        return ClockSync(stamp_ns, clock, *values[:6], method=SyncMethod(values[6]), utc_source=UtcSource(values[7]))
+        methods = SyncMethod(method), UtcSource(source)
     except ValueError as error:
         raise LogError(f"{CLOCK_SYNC.topic}: {error}") from None
+    return ClockSync(stamp_ns, clock, values[0], values[1], values[2], values[3], values[4], values[5], *methods)

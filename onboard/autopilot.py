@@ -5,7 +5,8 @@ The link may come and go: it is opened again and again, and the rest of the daem
 
 import logging
 import select
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -15,10 +16,14 @@ from flightlog import records
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import SourceError
 from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser, decode
+from onboard.autopilotclock import AutopilotClock
 from onboard.config import LinkConfig, StreamsConfig
+from onboard.health import LOW_RATE
 from onboard.lidar import Put
 from onboard.sources import Chunk, Source, UdpSource, open_source
 from onboard.timesync import LogTime, read_clocks
+from onboard.voice import COMPONENT as COMPONENT
+from onboard.voice import Voice
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -28,11 +33,9 @@ BATCH_NS: Final = 100 * NS_PER_MS
 _WAIT_S: Final = 0.1
 _RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)
 
-COMPONENT: Final = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER, who we are on the link."""
 _CHECK_NS: Final = 10 * NS_PER_S
-_LOW: Final = 0.4
-"""Share of the rate asked for below which it is asked for again. ArduCopter 3.1.3 gives half of 50 Hz and is content with it."""
+_OUTBOX: Final = 20
+"""Messages that wait to be sent; while the link is down the oldest go."""
 
 _STREAMS: Final = (
     ("raw_sensors_hz", dialect.MAV_DATA_STREAM_RAW_SENSORS, dialect.MAVLINK_MSG_ID_RAW_IMU),
@@ -69,6 +72,11 @@ class LinkCounts:
     armed: bool | None = None
     newest_ns: int = 0
     """Log time of the autopilot's newest verified frame [ns]."""
+    achieved_hz: dict[str, float] = field(default_factory=dict)
+    """Of each message asked for, over the last seconds looked at [Hz]."""
+    asked_hz: dict[str, int] = field(default_factory=dict)
+    requests: int = 0
+    """How many streams were asked for, or asked for again."""
 
 
 class Link(Worker):
@@ -91,7 +99,15 @@ class Link(Worker):
         self._topic = records.MAVLINK.topic + name
         self._chunks: list[Chunk] = []
         self._parser = FrameParser()
-        self._requester = Requester(config.streams)
+        self._voice = Voice()
+        self._requester = Requester(config.streams, self._voice)
+        self.clock = AutopilotClock(name)
+        self._outbox: deque[dialect.MAVLink_message] = deque(maxlen=_OUTBOX)
+
+    def tell(self, messages: Iterable[dialect.MAVLink_message]) -> None:
+        """Send messages to the autopilot and through it to the ground, if this is a link to talk on and an autopilot is heard."""
+        if self._config.requests and self.counts.connected and self.counts.autopilot is not None:
+            self._outbox.extend(messages)
 
     def work(self) -> None:
         """Open, read, open again, until asked to stop."""
@@ -127,21 +143,47 @@ class Link(Worker):
         poll.register(source.fileno(), select.POLLIN)
         while not self.stopping:
             if poll.poll(_WAIT_S * 1000):
-                self._chunks += source.read()
+                self._take(source.read())
             now_ns = self._log_time.at(read_clocks())
             if self._chunks and now_ns - self._chunks[0][0] >= BATCH_NS:
                 if isinstance(source, UdpSource):
                     self.counts.kernel_drops = source.drops
                 self._hand_over()
             if self._config.requests:
-                for data in self._requester.due(self.counts, now_ns):
-                    source.write(data)
+                self._talk(source, now_ns)
             self.progress()
             self.pause(source.pause_s)
-        self._chunks += source.read()
+        self._take(source.read())
+
+    def _take(self, chunks: list[Chunk]) -> None:
+        """Keep the chunks for the log, and have a look at the frames in them."""
+        self._chunks += chunks
+        for time_ns, data in chunks:
+            frames = self._parser.feed(time_ns, data)
+            note_frames(self.counts, frames)
+            for frame in frames:
+                if frame.known and (frame.system, frame.component) == self.counts.autopilot:
+                    answer = self.clock.hear(frame)
+                    if answer is not None:
+                        self.tell([answer])
+        self.counts.bad_bytes = self._parser.bad_bytes
+        self.counts.unknown_frames = self._parser.unknown
+
+    def _talk(self, source: Source, now_ns: int) -> None:
+        """Send what is due."""
+        for data in self._requester.due(self.counts, now_ns):
+            source.write(data)
+        if self.counts.autopilot is None:
+            return
+        system, version = self.counts.autopilot[0], self.counts.version
+        while self._outbox:
+            source.write(self._voice.frame(self._outbox.popleft(), system, version))
+        sent_ns = self._log_time.at(read_clocks())
+        if (question := self.clock.question(sent_ns)) is not None:
+            source.write(self._voice.frame(question, system, version))
 
     def _hand_over(self) -> None:
-        """Give the chunks to the recorder, and have a look at the frames in them."""
+        """Give the chunks to the recorder."""
         if not self._chunks:
             return
         chunks, self._chunks = self._chunks, []
@@ -150,10 +192,6 @@ class Link(Worker):
         self.counts.received_bytes += size
         if not self._put(self._topic, stamp_ns, records.encode_raw(stamp_ns, chunks, self.name), True):
             self.counts.queue_dropped_bytes += size
-        # In one go, because that is cheaper; the exact times are in the log.
-        note_frames(self.counts, self._parser.feed(stamp_ns, b"".join(data for _, data in chunks)))
-        self.counts.bad_bytes = self._parser.bad_bytes
-        self.counts.unknown_frames = self._parser.unknown
 
     def _tell_trouble(self, sentence: str) -> None:
         if sentence != self.counts.trouble:
@@ -201,12 +239,11 @@ class Requester:
     ArduCopter 3.1.3 knows only REQUEST_DATA_STREAM, and only as MAVLink 1: we answer in the version that the autopilot speaks.
     """
 
-    def __init__(self, streams: StreamsConfig) -> None:
+    def __init__(self, streams: StreamsConfig, voice: Voice | None = None) -> None:
         self._streams = [
             (stream, rate, message) for option, stream, message in _STREAMS if (rate := getattr(streams, option))
         ]
-        self._mavlink = dialect.MAVLink(None, srcComponent=COMPONENT)
-        self.requests = 0
+        self._voice = voice or Voice()
         self.start()
 
     def start(self) -> None:
@@ -220,12 +257,11 @@ class Requester:
         if counts.autopilot is None or now_ns - self._heartbeat_ns < NS_PER_S:
             return []
         self._heartbeat_ns = now_ns
-        self._mavlink.srcSystem = counts.autopilot[0]
-        heartbeat = self._mavlink.heartbeat_encode(
-            dialect.MAV_TYPE_ONBOARD_CONTROLLER, AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE
+        heartbeat = dialect.MAVLink_heartbeat_message(
+            dialect.MAV_TYPE_ONBOARD_CONTROLLER, AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
         )
         messages = [heartbeat, *self._requests(counts, counts.autopilot, now_ns)]
-        return [bytes(message.pack(self._mavlink, force_mavlink1=counts.version == 1)) for message in messages]
+        return [self._voice.frame(message, counts.autopilot[0], counts.version) for message in messages]
 
     def _requests(self, counts: LinkCounts, autopilot: tuple[int, int], now_ns: int) -> list[dialect.MAVLink_message]:
         if self._checked_ns is None:
@@ -234,11 +270,12 @@ class Requester:
             return []
         else:
             seconds = (now_ns - self._checked_ns) / NS_PER_S
-            low = [
-                (stream, rate, message)
-                for stream, rate, message in self._streams
-                if counts.messages[message] - self._before[message] < _LOW * rate * seconds
-            ]
+            hz = {
+                message: (counts.messages[message] - self._before[message]) / seconds for *_, message in self._streams
+            }
+            counts.achieved_hz = {dialect.mavlink_map[message].msgname: round(rate, 1) for message, rate in hz.items()}
+            counts.asked_hz = {dialect.mavlink_map[message].msgname: rate for _, rate, message in self._streams}
+            low = [(stream, rate, message) for stream, rate, message in self._streams if hz[message] < LOW_RATE * rate]
         self._checked_ns, self._before = now_ns, Counter(counts.messages)
-        self.requests += len(low)
-        return [self._mavlink.request_data_stream_encode(*autopilot, stream, rate, 1) for stream, rate, _ in low]
+        counts.requests += len(low)
+        return [dialect.MAVLink_request_data_stream_message(*autopilot, stream, rate, 1) for stream, rate, _ in low]

@@ -101,6 +101,10 @@ class RecorderConfig:
     """Where flight logs go and how often they are made safe."""
 
     directory: str = option("/var/lib/swathd", "folder of the flight logs; made if it is not there")
+    lidar: str = option(
+        "always", "when to record the lidar; armed: while the autopilot says so, or cannot be heard; all else always",
+        choices=("always", "armed"),
+    )  # fmt: skip
     sync_ms: int = option(
         500, "how often the log is forced on to the disk; a power cut loses about this much [ms]",
         minimum=50, maximum=10_000,

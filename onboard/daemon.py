@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -15,13 +16,24 @@ from flightlog import __version__, config, records
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mount import Mount, load_mount
-from flightlog.records import HostClock
-from onboard import health, leftovers, logfolder, notify
+from flightlog.records import ClockSync, HostClock
+from onboard import announce, health, leftovers, logfolder, notify
+from onboard.announce import Announcer
 from onboard.autopilot import Link
 from onboard.config import SwathdConfig
 from onboard.health import RecorderStatus, Status
+from onboard.journal import event
 from onboard.lidar import LidarPort
-from onboard.readings import LidarReadings, Rates, link_status
+from onboard.readings import (
+    Endurance,
+    LidarReadings,
+    Rates,
+    clock_status,
+    lidar_sync,
+    link_status,
+    may_fly,
+    temperature_c,
+)
 from onboard.recorder import Recorder
 from onboard.relay import Relay
 from onboard.segment import Segment
@@ -68,7 +80,8 @@ class Daemon:
 
         # The ports first: packets wait in their buffers while the log is opened.
         self._recorder: Recorder | None = None
-        self._lidar = LidarPort(settings.lidar, self._log_time, self._put)
+        self._only_armed = settings.recorder.lidar == "armed"
+        self._lidar = LidarPort(settings.lidar, self._log_time, self._put, self._is_flight)
         try:
             keep_free_bytes = 2 * settings.recorder.min_free_mb << 20
             self._salvager = leftovers.begin(self._directory, keep_free_bytes, settings.recorder.compression)
@@ -81,6 +94,8 @@ class Daemon:
             self._links[name] = Link(name, link, self._log_time, self._put)
         self._rates = Rates()
         self._lidar_readings = LidarReadings(self._lidar, settings.lidar.interface)
+        self._announcer, self._endurance = Announcer(), Endurance()
+        self._keep_free_bytes = settings.recorder.min_free_mb << 20
 
     def _open_segment(self, settings: SwathdConfig, mount: Mount) -> Segment:
         path = logfolder.next_segment_path(self._directory, self._boot_id)
@@ -99,6 +114,7 @@ class Daemon:
             "segment": path.stem,
         }
         topics = [records.LIDAR.topic, records.LIDAR_ACCOUNT.topic, records.POSITION.topic]
+        topics += [records.CLOCK_SYNC.topic]
         topics += [records.MAVLINK.topic + name for name in settings.links()]
         return Segment(
             path,
@@ -114,6 +130,13 @@ class Daemon:
         if self._relay is not None:
             self._relay.offer(topic, data)
         return self._recorder.put(topic, log_time_ns, data, vital)
+
+    def _is_flight(self) -> bool:
+        """Whether the lidar is to be recorded: where nobody can say that the vehicle is disarmed, it is."""
+        if not self._only_armed:
+            return True
+        log_ns = self._log_time.at(read_clocks())
+        return may_fly([link.counts for link in self._links.values()], log_ns)
 
     @property
     def _workers(self) -> list[Worker]:
@@ -136,7 +159,8 @@ class Daemon:
         self._salvager.start()
         if self._relay is not None:  # none of the workers: nothing of the recording depends on it
             self._relay.start()
-        _log.info("recording to %s", self._directory / self._segment_name)
+        name = self._segment_name
+        _log.info("recording to %s", self._directory / name, extra=event("recording", segment=name))
         try:
             self._attend()
         finally:
@@ -162,21 +186,45 @@ class Daemon:
             now_ns = time.monotonic_ns()
             clock = self._clock_watch.record()
             if abs(clock.step_ns) > NS_PER_S:
-                _log.warning("the wall clock was set by %.3f s; log time goes on evenly", clock.step_ns / NS_PER_S)
+                step_s = clock.step_ns / NS_PER_S
+                fields = event("clock_step", step_s=f"{step_s:.6f}")
+                _log.warning("the wall clock was set by %.3f s; log time goes on evenly", step_s, extra=fields)
             self._put(records.HOST_CLOCK.topic, clock.log_ns, records.encode_host_clock(clock), True)
+            syncs = self._clock_syncs(clock)
             status = self._status()
+            status = replace(
+                status,
+                clocks={sync.clock: clock_status(sync, clock.realtime_ns - clock.log_ns) for sync in syncs},
+                temperature_c=temperature_c(),
+            )
             self._write_status(status)
+            self._announce(status)
             if not is_ready:
                 notify.ready(health.summary(status))
                 is_ready = True
             self._stroke(status, now_ns)
             self._stop.wait(_STATUS_S)
 
+    def _clock_syncs(self, clock: HostClock) -> list[ClockSync]:
+        """How the devices' clocks stand to log time, also for the log."""
+        found = [link.clock.sync(clock.log_ns) for link in self._links.values()]
+        syncs = [sync for sync in (lidar_sync(self._lidar, clock.log_ns), *found) if sync is not None]
+        for sync in syncs:
+            self._put(records.CLOCK_SYNC.topic, sync.log_ns, records.encode_clock_sync(sync), True)
+        return syncs
+
+    def _announce(self, status: Status) -> None:
+        """Tell the pilot, through the autopilots."""
+        text = self._announcer.next(announce.states(status))
+        messages = [*announce.numbers(status), *([text] if text is not None else [])]
+        for link in self._links.values():
+            link.tell(messages)
+
     def _stroke(self, status: Status, now_ns: int) -> None:
         """Tell systemd that all is well, if it is."""
         reasons = health.stalled({worker.name: worker.progress_ns for worker in self._workers}, now_ns)
         if reasons:
-            _log.error("%s", "; ".join(reasons))
+            _log.error("%s", "; ".join(reasons), extra=event("hang"))
             notify.status("; ".join(reasons))
         else:
             notify.status(health.summary(status))
@@ -228,6 +276,7 @@ class Daemon:
         assert self._recorder is not None
         counts, backlog = self._recorder.counts, self._recorder.backlog
         leftover = self._salvager.counts
+        free_bytes = logfolder.free_bytes(self._directory)
         return RecorderStatus(
             segment=counts.segment,
             messages=counts.messages,
@@ -236,7 +285,8 @@ class Daemon:
             refused=backlog.refused,
             sync_age_s=(now_ns - counts.last_sync_ns) / NS_PER_S,
             slowest_sync_ms=counts.slowest_sync_ms,
-            free_bytes=logfolder.free_bytes(self._directory),
+            free_bytes=free_bytes,
+            minutes_left=self._endurance.minutes(now_ns / NS_PER_S, free_bytes, self._keep_free_bytes),
             segments=counts.segments,
             space=counts.space.value,
             refused_for_space=counts.refused_for_space,

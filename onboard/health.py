@@ -15,6 +15,8 @@ STALE_S: Final = 5.0
 """A status older than this says nothing about now."""
 LINK_SILENT_S: Final = 3.0
 """An autopilot unheard for this long is silent; it sends a heartbeat each second."""
+LOW_RATE: Final = 0.4
+"""Share of the rate asked for below which a message is low. ArduCopter 3.1.3 gives half of 50 Hz and is content with it."""
 STALLED_NS: Final = 5 * NS_PER_S
 """A worker without progress for this long hangs; a slow card may well hold the recorder for a second or two."""
 
@@ -49,6 +51,8 @@ class LidarStatus:
     received: int = 0
     kept: int = 0
     not_armed: int = 0
+    recording: bool = True
+    """False: not armed, and only flights are to be recorded."""
     masked_packets: int = 0
     kernel_drops: int = 0
     queue_drops: int = 0
@@ -78,6 +82,10 @@ class LinkStatus:
     unknown_frames: int = 0
     dropped_bytes: int = 0
     kernel_drops: int = 0
+    achieved_hz: dict[str, float] = field(default_factory=dict)
+    asked_hz: dict[str, int] = field(default_factory=dict)
+    """Of the messages asked for."""
+    requests: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +100,8 @@ class RecorderStatus:
     sync_age_s: float = 0.0
     slowest_sync_ms: float = 0.0
     free_bytes: int = 0
+    minutes_left: float | None = None
+    """Until the lidar is no longer recorded, at the rate of the last minute; None: not known yet."""
     segments: int = 0
     """Opened since the start."""
     space: str = "room"
@@ -105,6 +115,20 @@ class RecorderStatus:
     leftovers_mended: int = 0
     leftovers_left: int = 0
     """Those that are no logs, or for which there was no space."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStatus:
+    """How a device's clock stands to log time; see /clock_sync."""
+
+    method: str
+    skew_ppm: float
+    uncertainty_ms: float
+    samples: int
+    restarts: int
+    utc_source: str
+    utc_minus_wall_s: float | None = None
+    """What its UTC has more than the host's wall clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +163,9 @@ class Status:
     recorder: RecorderStatus
     failures: list[str] = field(default_factory=list)
     downlink: DownlinkStatus | None = None
+    clocks: dict[str, ClockStatus] = field(default_factory=dict)
+    temperature_c: float | None = None
+    """Of the board; None: it has no sensor."""
 
 
 def to_json(status: Status) -> str:
@@ -153,6 +180,7 @@ def from_json(text: str, place: str) -> Status:
         tree["lidar"] = LidarStatus(**tree["lidar"] | {"state": State(tree["lidar"]["state"])})
         tree["links"] = {name: LinkStatus(**link) for name, link in tree["links"].items()}
         tree["recorder"] = RecorderStatus(**tree["recorder"])
+        tree["clocks"] = {name: ClockStatus(**clock) for name, clock in tree["clocks"].items()}
         tree["downlink"] = None if tree["downlink"] is None else DownlinkStatus(**tree["downlink"])
         return Status(**tree)
     except (ValueError, KeyError, TypeError, AttributeError):
@@ -241,9 +269,17 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
         return [(Level.WARNING, f"link {name}: open, but no autopilot heard")]
     if link.age_s > LINK_SILENT_S:
         return [(Level.WARNING, f"link {name}: autopilot silent for {link.age_s:.0f} s")]
+    found = [
+        (
+            Level.WARNING,
+            f"link {name}: {message} at {hz:.1f} Hz of {link.asked_hz[message]} asked for; is its rate set elsewhere?",
+        )
+        for message, hz in link.achieved_hz.items()
+        if hz < LOW_RATE * link.asked_hz.get(message, 0)
+    ]
     if link.dropped_bytes:
-        return [(Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow")]
-    return []
+        found.append((Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow"))
+    return found
 
 
 _SPACE: Final = {
@@ -273,25 +309,26 @@ def summary(status: Status) -> str:
     )
 
 
+_PPS: Final = {0: "not told", 1: "synchronising", 2: "locked", 3: "error"}
+"""Firmware of 2012 leaves it 0 even when locked."""
+
+
 def report(status: Status, verdict: Verdict) -> list[str]:
     """The lines of `swathd health`."""
-    lidar, recorder = status.lidar, status.recorder
     lines = [f"{verdict.level.name}: {summary(status)}", *(f"  {finding}" for finding in verdict.findings)]
-    lines.append(
-        f"lidar     {lidar.packets_s:.0f} packets/s, {lidar.kept} kept, {lidar.masked_packets} masked, "
-        f"{lidar.kernel_drops} + {lidar.queue_drops} dropped, GPS sentence {lidar.nmea or 'none'}"
-    )
+    lines += _report_lidar(status.lidar)
     for name, link in status.links.items():
-        heard = f"autopilot {link.autopilot}, MAVLink {link.version}" if link.autopilot else "no autopilot"
-        armed = {None: "unknown", True: "armed", False: "disarmed"}[link.armed]
-        lines.append(
-            f"{name:9} {link.frames_s:.0f} frames/s, {heard}, {armed}, {link.bad_bytes} bad bytes, "
-            f"{link.unknown_frames} unknown frames"
-        )
+        lines += _report_link(name, link)
+    for name, clock in status.clocks.items():
+        lines.append(_report_clock(name, clock))
+    temperature = "" if status.temperature_c is None else f", {status.temperature_c:.0f} deg C"
+    lines.append(f"host      up {status.uptime_s:.0f} s, wall clock set {status.clock_steps} times{temperature}")
+    recorder = status.recorder
+    left = "" if recorder.minutes_left is None else f", {recorder.minutes_left:.0f} min left"
     lines.append(
         f"recorder  {recorder.segment}, {recorder.bytes_on_disk / 1e6:.1f} MB, last sync "
         f"{recorder.sync_age_s:.1f} s ago, slowest {recorder.slowest_sync_ms:.0f} ms, "
-        f"{recorder.free_bytes / 1e9:.1f} GB free"
+        f"{recorder.free_bytes / 1e9:.1f} GB free{left}"
     )
     if (downlink := status.downlink) is not None:
         lines.append(
@@ -299,3 +336,49 @@ def report(status: Status, verdict: Verdict) -> list[str]:
             f"{downlink.dropped} dropped, {downlink.unheard} refused there"
         )
     return lines
+
+
+def _report_lidar(lidar: LidarStatus) -> list[str]:
+    expected = f" of {lidar.expected_packets_s:.0f}" if lidar.expected_packets_s else ""
+    idle = "" if lidar.recording else ", not recorded: not armed"
+    setting = (
+        f", {lidar.rpm:.0f} rpm, {lidar.return_mode}, {lidar.fov_start_deg:.0f} to {lidar.fov_end_deg:.0f} deg"
+        if lidar.return_mode
+        else ""
+    )
+    return [
+        f"lidar     {lidar.state}, {lidar.packets_s:.0f}{expected} packets/s{setting}{idle}",
+        (
+            f"          {lidar.kept} kept, {lidar.masked_packets} masked, dropped {lidar.kernel_drops} by the kernel and "
+            f"{lidar.queue_drops} by the queue, {sum(lidar.rejected.values())} refused"
+        ),
+        (
+            f"          position {lidar.position_packets_s:.0f} packets/s, PPS {_PPS.get(lidar.pps, lidar.pps)}, "
+            f"GPS sentence {lidar.nmea or 'none'}"
+        ),
+    ]
+
+
+def _report_link(name: str, link: LinkStatus) -> list[str]:
+    heard = f"autopilot {link.autopilot}, MAVLink {link.version}" if link.autopilot else "no autopilot"
+    armed = {None: "unknown", True: "armed", False: "disarmed"}[link.armed]
+    lines = [
+        (
+            f"{name:9} {link.frames_s:.0f} frames/s, {heard}, {armed}, {link.bad_bytes} bad bytes, "
+            f"{link.unknown_frames} unknown frames"
+        )
+    ]
+    if link.achieved_hz:
+        rates = ", ".join(f"{message} {hz:.1f} of {link.asked_hz[message]}" for message, hz in link.achieved_hz.items())
+        lines.append(f"          Hz: {rates}")
+    return lines
+
+
+def _report_clock(name: str, clock: ClockStatus) -> str:
+    utc = ""
+    if clock.utc_minus_wall_s is not None:
+        utc = f", UTC of {clock.utc_source} is {clock.utc_minus_wall_s:+.3f} s from the wall clock"
+    return (
+        f"clock     {name} by {clock.method}, within {clock.uncertainty_ms:.1f} ms, {clock.skew_ppm:+.1f} ppm, "
+        f"{clock.samples} samples, {clock.restarts} restarts{utc}"
+    )

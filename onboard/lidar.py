@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import hdl32e, records
-from flightlog.constants import NS_PER_S
+from flightlog.constants import HOUR_NS, NS_PER_S, NS_PER_US
 from flightlog.records import SCAN_PACKET_DTYPE, LidarAccount
 from onboard import fovmask, lidarstate
 from onboard.batch import BATCH_NS, Batch
+from onboard.clocksync import Envelope
 from onboard.config import LidarConfig
 from onboard.datagrams import granted_buffer_bytes, open_udp
 from onboard.fovmask import Window
@@ -32,6 +33,8 @@ _SMALL_BUFFER_POLL_S: Final = 0.02
 _IDLE_POLL_S: Final = 0.02
 """While nothing comes: what comes next may come at any rate."""
 _POSITION_SLOTS: Final = 128
+_STAMP_NS: Final = 50 * NS_PER_US
+"""What a lidar's clock is good for when it follows a pulse (M-A p. 9)."""
 _OPEN_NS: Final = 3 * NS_PER_S
 """A lidar silent for this long: everything is let in and looked at again, to tell why; it is not recorded."""
 _FORGET_NS: Final = 10 * NS_PER_S
@@ -49,6 +52,7 @@ class LidarCounts:
     good: int = 0
     """Data packets of the lidar, recorded or not."""
     kept: int = 0
+    recording: bool = True
     not_armed: int = 0
     """Good ones not recorded, because the vehicle was not armed."""
     masked_packets: int = 0
@@ -69,8 +73,6 @@ class LidarCounts:
     """The newest position packet's sentence."""
     position_ns: int = 0
     """Log time of that packet [ns]."""
-    stamp_us: int = 0
-    """The newest good data packet's own stamp [us past the hour]."""
     sensor: str = ""
     """Address of the lidar, once it is known."""
 
@@ -104,6 +106,7 @@ class LidarPort(Worker):
         self._is_filtered = False
         self._heard_ns = time.monotonic_ns()
         self._seen = np.zeros(SECTORS, np.bool_)
+        self.clock = Envelope(HOUR_NS, _STAMP_NS)
         self._newest: npt.NDArray[np.void] | None = None
         self.window = Window.from_degrees(config.fov.start_deg, config.fov.end_deg)
         self._put = put
@@ -199,14 +202,16 @@ class LidarPort(Worker):
         self._sensor = int(addresses[np.argmax(counts)])
         _log.info("the lidar is at %s", address_text(self._sensor))
 
-    def _heard(self, packets: npt.NDArray[np.void]) -> None:
+    def _heard(self, packets: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
         """Note good packets of the lidar."""
         assert self._sensor is not None
         self._heard_ns = time.monotonic_ns()
         self._seen |= sectors_seen(packets["data"])
         self._newest = packets["data"][-1:].copy()
         self.counts.good += len(packets)
-        self.counts.stamp_us = int(self._newest["stamp_us"][0])
+        stamp_ns = packets["data"]["stamp_us"].astype(np.int64) * NS_PER_US
+        first = int(np.argmax(stamp_ns - time_ns))  # the one that was on its way the shortest
+        self.clock.add(int(time_ns[first]), int(stamp_ns[first]))
         if not self._is_filtered:
             self._is_filtered = True
             self.counts.sensor = address_text(self._sensor)
@@ -245,7 +250,7 @@ class LidarPort(Worker):
         whole = packets if ours.all() else fovmask.select(packets, ours)
         stamp_ns = int(time_ns[-1]) if len(time_ns) else batch.now_ns()
         if len(whole):
-            self._heard(whole)
+            self._heard(whole, time_ns if ours.all() else time_ns[ours])
             self.counts.newest_ns = stamp_ns
         account = LidarAccount(
             received=len(packets) + refused,
@@ -254,7 +259,8 @@ class LidarPort(Worker):
             rejected_sender=strangers + refused,
             kernel_drops=drops,
         )
-        if self._wanted():
+        self.counts.recording = self._wanted()
+        if self.counts.recording:
             self._record(whole, stamp_ns, account)
         else:
             self.counts.not_armed += len(whole)

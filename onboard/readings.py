@@ -1,15 +1,29 @@
 """What the receivers count, read once a second into what the status says: rates, ages, states."""
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
 
 from flightlog.constants import NS_PER_MS, NS_PER_S
+from flightlog.nmea import parse_rmc
+from flightlog.records import ClockSync
 from onboard import lidarstate
 from onboard.autopilot import LinkCounts
-from onboard.health import LidarStatus, LinkStatus
+from onboard.clocksync import utc_of_lidar
+from onboard.health import ClockStatus, LidarStatus, LinkStatus
 from onboard.lidar import LidarPort
 from onboard.packetfilter import address_number
 from onboard.sensorview import SensorView
+
+_THERMAL: Final = Path("/sys/class/thermal")
+_ENDURANCE_S: Final = 10.0
+"""Over less than this the log's growth is not told from its bursts."""
+
+_ARMED_NS: Final = 10 * NS_PER_S
+"""An autopilot unheard for this long may have been armed since."""
 
 PerSecond = Callable[[str, int], float]
 
@@ -86,6 +100,7 @@ class LidarReadings:
             received=counts.received,
             kept=counts.kept,
             not_armed=counts.not_armed,
+            recording=counts.recording,
             masked_packets=counts.masked_packets,
             kernel_drops=counts.kernel_drops,
             queue_drops=counts.queue_drops,
@@ -114,4 +129,75 @@ def link_status(name: str, counts: LinkCounts, log_ns: int, per_second: PerSecon
         unknown_frames=counts.unknown_frames,
         dropped_bytes=counts.queue_dropped_bytes,
         kernel_drops=counts.kernel_drops,
+        achieved_hz=counts.achieved_hz,
+        asked_hz=counts.asked_hz,
+        requests=counts.requests,
     )
+
+
+def lidar_sync(port: LidarPort, log_ns: int) -> ClockSync | None:
+    """The lidar's clock for the log, with the hour from the newest GPS sentence that it passed on."""
+    line = port.clock.line(log_ns)
+    if line is None:
+        return None
+    counts = port.counts
+    sentence_ns, rmc = counts.position_ns, parse_rmc(counts.nmea)
+    utc_ns, source = utc_of_lidar(sentence_ns + line.offset_at(sentence_ns), rmc)
+    return ClockSync(
+        log_ns=log_ns,
+        clock="lidar",
+        offset_ns=line.offset_ns,
+        skew_ppm=line.skew_ppm,
+        uncertainty_ns=line.uncertainty_ns,
+        utc_offset_ns=utc_ns + line.offset_ns if source else 0,
+        samples=line.samples,
+        restarts=port.clock.restarts,
+        method=line.method,
+        utc_source=source,
+    )
+
+
+def clock_status(sync: ClockSync, wall_minus_log_ns: int) -> ClockStatus:
+    """What the status says of a clock."""
+    return ClockStatus(
+        method=sync.method.name,
+        skew_ppm=round(sync.skew_ppm, 2),
+        uncertainty_ms=round(sync.uncertainty_ns / NS_PER_MS, 3),
+        samples=sync.samples,
+        restarts=sync.restarts,
+        utc_source=sync.utc_source.name,
+        utc_minus_wall_s=(sync.utc_offset_ns - wall_minus_log_ns) / NS_PER_S if sync.utc_source else None,
+    )
+
+
+class Endurance:
+    """How long the disk lasts, by what the log took of it over the last minute."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque(maxlen=61)
+
+    def minutes(self, time_s: float, free_bytes: int, floor_bytes: int) -> float | None:
+        """Until `floor_bytes` are left; None: not known yet. To be asked once a second."""
+        if self._marks and free_bytes > self._marks[-1][1] + (64 << 20):  # something was deleted
+            self._marks.clear()
+        self._marks.append((time_s, free_bytes))
+        then_s, then_bytes = self._marks[0]
+        if time_s - then_s < _ENDURANCE_S or then_bytes <= free_bytes:
+            return None
+        rate = (then_bytes - free_bytes) / (time_s - then_s)
+        return round(max(0, free_bytes - floor_bytes) / rate / 60, 1)
+
+
+def temperature_c(zones: Path = _THERMAL) -> float | None:
+    """Of the hottest of the board's sensors; None: it has none."""
+    found = []
+    for zone in zones.glob("thermal_zone*/temp"):
+        with suppress(OSError, ValueError):
+            found.append(int(zone.read_text(encoding="ascii")) / 1000)
+    return max(found, default=None)
+
+
+def may_fly(links: Sequence[LinkCounts], log_ns: int) -> bool:
+    """Whether the vehicle is armed, or nobody heard lately can say that it is not."""
+    heard = [counts.armed for counts in links if log_ns - counts.newest_ns < _ARMED_NS]
+    return True in heard or False not in heard

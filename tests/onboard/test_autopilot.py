@@ -140,14 +140,14 @@ def test_a_serial_autopilot_is_asked_for_its_streams_in_its_own_version(port: Pt
     link.stop()
     messages = dialect.MAVLink(None).parse_buffer(answer)
     kinds = [message.get_type() for message in messages]
-    assert kinds == ["HEARTBEAT"] + ["REQUEST_DATA_STREAM"] * 6
+    assert kinds == ["HEARTBEAT"] + ["REQUEST_DATA_STREAM"] * 6 + ["TIMESYNC"]
     assert {message.get_msgbuf()[0] for message in messages} == {0xFE}  # 3.1.3 is deaf to version 2
     assert {(m.get_srcSystem(), m.get_srcComponent()) for m in messages} == {(1, 191)}
     assert (messages[0].type, messages[0].autopilot, messages[0].system_status) == (18, 8, 4)
-    assert {(m.req_stream_id, m.req_message_rate) for m in messages[1:]} == {
+    assert {(m.req_stream_id, m.req_message_rate) for m in messages[1:7]} == {
         (1, 50), (2, 5), (6, 10), (10, 50), (11, 2), (12, 2),
     }  # fmt: skip
-    assert {(m.target_system, m.target_component, m.start_stop) for m in messages[1:]} == {(1, 1, 1)}
+    assert {(m.target_system, m.target_component, m.start_stop) for m in messages[1:7]} == {(1, 1, 1)}
 
 
 def test_an_unplugged_autopilot_is_taken_up_again_into_the_same_log(tmp_path: Path) -> None:

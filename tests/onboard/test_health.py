@@ -4,7 +4,7 @@ import pytest
 
 from flightlog.errors import SwathError
 from onboard import health
-from onboard.health import Level, LidarStatus, LinkStatus, RecorderStatus, Status
+from onboard.health import ClockStatus, Level, LidarStatus, LinkStatus, RecorderStatus, Status
 from onboard.lidarstate import State
 
 S = 1_000_000_000
@@ -18,6 +18,7 @@ GOOD = Status(
     lidar=LidarStatus(age_s=0.1, packets_s=1808.0, received=18080, kept=10500),
     links={"ins": LinkStatus(connected=True, age_s=0.1, frames_s=60.0, autopilot="1/1", version=1)},
     recorder=RecorderStatus(segment="00001-000.mcap", sync_age_s=0.4),
+    clocks={"ins": ClockStatus("TIMESYNC", 1.5, 2.0, 60, 0, "SYSTEM_TIME", -3600.5)},
 )
 
 
@@ -94,7 +95,9 @@ def test_a_worker_is_stalled_when_it_has_made_no_progress_for_too_long() -> None
 def test_the_report_has_the_verdict_first() -> None:
     lines = health.report(GOOD, health.judge(GOOD, 101 * S, "b"))
     assert lines[0].startswith("GOOD: 00001-000.mcap: lidar 1808/s")
-    assert len(lines) == 4
+    assert [line.split()[0] for line in lines[1:]] == [
+        "lidar", "10500", "position", "ins", "clock", "host", "recorder",
+    ]  # fmt: skip
 
 
 def test_armed_is_known_only_of_an_autopilot_that_is_heard_now() -> None:

@@ -1,0 +1,29 @@
+"""Our own words on a MAVLink link: frames of the companion computer, in the version of MAVLink that the autopilot speaks."""
+
+from typing import Final
+
+from fastcrc.crc16 import mcrf4xx as checksum
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+COMPONENT: Final = 191
+"""MAV_COMP_ID_ONBOARD_COMPUTER, who we are on the link."""
+_STATUSTEXT_BYTES: Final = 51
+"""MAVLink 1 has no extension fields, but pymavlink sends those of STATUSTEXT."""
+
+
+class Voice:
+    """Numbers and packs what we send."""
+
+    def __init__(self) -> None:
+        self._mavlink = dialect.MAVLink(None, srcComponent=COMPONENT)
+
+    def frame(self, message: dialect.MAVLink_message, system: int, version: int) -> bytes:
+        """Pack a message, as of the autopilot's system."""
+        self._mavlink.srcSystem = system
+        data = bytes(message.pack(self._mavlink, force_mavlink1=version == 1))
+        self._mavlink.seq = (self._mavlink.seq + 1) % 256
+        if version == 1 and message.get_msgId() == dialect.MAVLINK_MSG_ID_STATUSTEXT:
+            body = bytes((_STATUSTEXT_BYTES,)) + data[2 : 6 + _STATUSTEXT_BYTES]
+            sum_ = checksum(body + bytes((message.crc_extra,)))
+            data = data[:1] + body + sum_.to_bytes(2, "little")
+        return data
