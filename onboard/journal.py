@@ -35,12 +35,12 @@ def priority(level: int) -> int:
     return next((number for limit, number in _PRIORITIES if level >= limit), _DEBUG)
 
 
-def fields(record: logging.LogRecord) -> dict[str, str]:
+def fields(record: logging.LogRecord) -> dict[str, str | int]:
     """Fields of the journal for a record, the message excepted."""
     return {
         "PRIORITY": str(priority(record.levelno)),
         "CODE_FILE": record.pathname,
-        "CODE_LINE": str(record.lineno),
+        "CODE_LINE": record.lineno,
         "CODE_FUNC": record.funcName or "",
         "SWATH_THREAD": record.threadName or "",
         **getattr(record, _FIELDS, {}),

@@ -14,7 +14,7 @@ def record(level: int, text: str, extra: Mapping[str, object] | None = None) -> 
 
 def test_an_event_has_fields_that_a_search_finds() -> None:
     found = journal.fields(record(logging.ERROR, "no", journal.event("hang", worker="lidar", silent_s=6.5)))
-    expected = {"PRIORITY": "3", "CODE_FILE": "file.py", "CODE_LINE": "7", "CODE_FUNC": "func"}
+    expected = {"PRIORITY": "3", "CODE_FILE": "file.py", "CODE_LINE": 7, "CODE_FUNC": "func"}
     assert {key: found[key] for key in expected} == expected
     assert {key: value for key, value in found.items() if key.startswith("SWATH_") and key != "SWATH_THREAD"} == {
         "SWATH_EVENT": "hang", "SWATH_WORKER": "lidar", "SWATH_SILENT_S": "6.5",
