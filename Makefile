@@ -61,8 +61,13 @@ check: setup
 	$(BIN)/lint-imports
 	$(MAKE) --no-print-directory test
 
+# Its last line is one JSON object: what the tests found, all of them together.
 soak: setup
-	$(PYTEST) -m soak
+	@rm -f .soak-figures
+	@outcome=0; SWATH_FIGURES=$(CURDIR)/.soak-figures $(PYTEST) -m soak || outcome=$$?; \
+	$(BIN)/python -c 'import json, pathlib; p = pathlib.Path(".soak-figures"); found = {}; \
+	[found.update(json.loads(line)) for line in (p.read_text().splitlines() if p.exists() else [])]; print(json.dumps(found))'; \
+	rm -f .soak-figures; exit $$outcome
 
 bench-%: setup
 	@$(BIN)/python benchmarks/$*.py
