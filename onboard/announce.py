@@ -7,7 +7,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog.constants import NS_PER_S
-from onboard.health import LINK_SILENT_S, STALLED_NS, Level, Status
+from onboard.health import LINK_SILENT_S, STALLED_NS, Level, LidarStatus, Status
 from onboard.lidarstate import State
 
 TEXT_BYTES: Final = 50
@@ -58,15 +58,18 @@ class Announcer:
         return text(*self._waiting.popleft()) if self._waiting else None
 
 
+def _doing(lidar: LidarStatus) -> str:
+    if lidar.state != State.GOOD:
+        return str(lidar.state)
+    return "recording" if lidar.recording else "ready, not armed"
+
+
 def states(status: Status) -> dict[str, tuple[int, str]]:
     """What the pilot should know, by subject: severity and words without figures, so that they change with the state only."""
     lidar, recorder = status.lidar, status.recorder
     good, warning, critical = (_SEVERITY[level] for level in Level)
     told = {
-        "lidar": (
-            {State.GOOD: good, State.RATE_LOW: warning}.get(lidar.state, critical),
-            "lidar " + ("recording" if lidar.state == State.GOOD and lidar.recording else str(lidar.state)),
-        ),
+        "lidar": ({State.GOOD: good, State.RATE_LOW: warning}.get(lidar.state, critical), f"lidar {_doing(lidar)}"),
         "lidar losses": (warning, "lidar packets lost")
         if lidar.kernel_drops + lidar.queue_drops
         else (good, "no losses"),

@@ -105,9 +105,14 @@ class Link(Worker):
         self._outbox: deque[dialect.MAVLink_message] = deque(maxlen=_OUTBOX)
 
     def tell(self, messages: Iterable[dialect.MAVLink_message]) -> None:
-        """Send messages to the autopilot and through it to the ground, if this is a link to talk on and an autopilot is heard."""
-        if self._config.requests and self.counts.connected and self.counts.autopilot is not None:
+        """Send messages to the autopilot and through it to the ground, if it listens."""
+        if self.listens:
             self._outbox.extend(messages)
+
+    @property
+    def listens(self) -> bool:
+        """Whether this is a link to talk on, and an autopilot is heard on it."""
+        return self._config.requests and self.counts.connected and self.counts.autopilot is not None
 
     def work(self) -> None:
         """Open, read, open again, until asked to stop."""

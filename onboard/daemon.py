@@ -214,7 +214,9 @@ class Daemon:
         return syncs
 
     def _announce(self, status: Status) -> None:
-        """Tell the pilot, through the autopilots."""
+        """Tell the pilot, through the autopilots; news wait until one listens."""
+        if not any(link.listens for link in self._links.values()):
+            return
         text = self._announcer.next(announce.states(status))
         messages = [*announce.numbers(status), *([text] if text is not None else [])]
         for link in self._links.values():
