@@ -25,6 +25,9 @@ REBOOT_MS: Final = 5_000
 HALF_MS_NS: Final = NS_PER_MS // 2
 """Autopilots cut their boot time to whole milliseconds: on average half of one is missing."""
 
+LOST_MS: Final = 10_000
+"""A boot time that lags the receive time by more than this from one message to the next is a reboot; links delay by seconds."""
+
 _STAMP_OFFSETS: Final = {
     mavlink.message_id(name): mavlink.payload_dtype(mavlink.message_id(name)).fields["time_boot_ms"][1]  # type: ignore[index]
     for name in (
@@ -122,12 +125,26 @@ def boots(all_frames: Sequence[Frame]) -> list[Boot]:
     address = _autopilot(all_frames)
     mine = [f for f in all_frames if f.known and (f.system, f.component) == address]
     clock_ms = _running_clock_ms(mine)
-    starts = [0, *(np.flatnonzero(np.diff(clock_ms) < -REBOOT_MS) + 1), len(mine)]
+    starts = [0, *_reboots(mine, clock_ms), len(mine)]
     return [
         _boot(number, address, mine[a:b], clock_ms[a:b])
         for number, (a, b) in enumerate(itertools.pairwise(starts))
         if b > a
     ]
+
+
+def _reboots(mine: Sequence[Frame], clock_ms: npt.NDArray[np.int64]) -> list[int]:
+    """Frames at which another boot begins: its clock falls back, or has run for much less than the time that passed.
+
+    The second is what a reboot looks like that is heard of again only when its clock is past the old one.
+    """
+    own = np.array([i for i, frame in enumerate(mine) if frame.message_id in _STAMP_OFFSETS], np.int64)
+    if len(own) < 2:
+        return []
+    passed_ms = np.diff(np.array([mine[i].time_ns for i in own.tolist()], np.int64)) // NS_PER_MS
+    counted_ms = np.diff(clock_ms[own])
+    reboot = (counted_ms < -REBOOT_MS) | (passed_ms - counted_ms > LOST_MS)
+    return [int(i) for i in own[1:][reboot]]
 
 
 def _autopilot(all_frames: Sequence[Frame]) -> tuple[int, int]:

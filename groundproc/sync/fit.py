@@ -25,6 +25,8 @@ BIAS_KNOT_S: Final = 30.0
 DRIFT_PRIOR_PPM: Final = 60.0
 """Standard deviation of the drift between two crystals before the data speak; the lidar's alone is some 58 ppm."""
 ROTATION_PRIOR_RAD: Final = 0.05
+HUBER: Final = 1.5
+"""Standard deviations beyond which a residual pulls no harder."""
 BLOCK_S: Final = 2.0
 """Residuals further apart than this are taken to be independent in the stated sigma."""
 
@@ -53,7 +55,7 @@ def fit(lidar: GyroTrack, ins: GyroTrack, peak: Peak, cutoff_hz: float, mat_moun
         axes = np.eye(3)
         columns = [-moved, -moved * (time_s - mid_s)[:, None], *(np.cross(axis, turned) for axis in axes)]
         jacobian = np.stack([unbias(column) for column in columns], axis=-1)
-        weight = _weights(residual)
+        weight, curvature = _weights(residual, moved)
         normal = np.einsum("nki,nk,nkj->ij", jacobian, weight, jacobian) + np.diag(prior)
         score = np.einsum("nki,nk,nk->i", jacobian, weight, residual)
         step = np.linalg.solve(normal, score - prior * np.array([0.0, shift[1], *turned_by]))
@@ -62,7 +64,9 @@ def fit(lidar: GyroTrack, ins: GyroTrack, peak: Peak, cutoff_hz: float, mat_moun
         rotation = mat_from_quat(quat_exp(step[2:])) @ rotation
         if abs(step[0]) < 1e-7 and np.abs(step[2:]).max() < 1e-6:
             break
-    covariance = _covariance(time_s, np.einsum("nki,nk,nk->ni", jacobian, weight, residual), normal)
+    scores = np.einsum("nki,nk,nk->ni", jacobian, weight, residual)
+    information = np.einsum("nki,nk,nkj->ij", jacobian, curvature, jacobian) + np.diag(prior)
+    covariance = _covariance(time_s, scores, information)
     angle = None
     if mat_mount is not None:
         angle = float(np.degrees(np.arccos(np.clip((np.trace(rotation @ mat_mount.T) - 1.0) / 2.0, -1.0, 1.0))))
@@ -109,11 +113,27 @@ def _bias_projector(time_s: Array) -> Callable[[Array], Array]:
     return unbias
 
 
-def _weights(residual: Array) -> Array:
-    """Huber weights over each axis' own variance, shape (n, 3)."""
-    scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-6)
-    normed = np.abs(residual) / scale
-    return np.asarray(np.where(normed > 1.5, 1.5 / np.maximum(normed, 1.5), 1.0) / scale**2)
+def _weights(residual: Array, moved: Array) -> tuple[Array, Array]:
+    """Huber weights over each sample's own variance, and the curvature of the loss, both of shape (n, 3).
+
+    A sample whose stamp is off is wrong by its slope times that: the variance is that of the axis plus the square of the stamp's
+    jitter times the square of the slope, both learnt from the residuals. An outlier adds to the loss but not to its curvature.
+    """
+    axis = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-6) ** 2
+    variance = np.broadcast_to(axis, residual.shape)
+    for _ in range(3):
+        square = np.minimum(residual**2, 25.0 * variance).ravel()
+        # each axis its own level, one jitter for all
+        design = np.zeros((residual.size, 4))
+        design[np.arange(residual.size), np.tile(np.arange(3), len(residual))] = 1.0
+        design[:, 3] = moved.ravel() ** 2
+        relative = design / variance.reshape(-1, 1)
+        level, *_ = np.linalg.lstsq(relative, square / variance.ravel(), rcond=None)
+        level = np.maximum(level, [*(0.05 * axis), 0.0])
+        variance = level[:3] + level[3] * moved**2
+    normed = np.abs(residual) / np.sqrt(variance)
+    inlier = normed <= HUBER
+    return np.where(inlier, 1.0, HUBER / np.maximum(normed, HUBER)) / variance, inlier / variance
 
 
 def _covariance(time_s: Array, scores: Array, normal: Array) -> Array:
