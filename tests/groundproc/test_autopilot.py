@@ -106,6 +106,20 @@ def test_a_reboot_is_told_from_messages_out_of_order(frames_of: FramesOf) -> Non
     assert second.span_ns() == (2_500 * MS + HALF, 2_580 * MS + HALF)
 
 
+def test_a_reboot_heard_of_late_is_told_by_the_time_that_passed(frames_of: FramesOf) -> None:
+    # rebooted at 20 s, heard again when its new clock stands at 30 s: 40 s have passed, 10 s were counted
+    messages = [(HOST_NS, heartbeat()), (HOST_NS, attitude(19_960)), (HOST_NS + 40 * MS, attitude(20_000))]
+    messages += [(HOST_NS + 40_040 * MS, attitude(30_000)), (HOST_NS + 40_080 * MS, attitude(30_040))]
+    first, second = autopilot.boots(frames_of(messages))
+    assert (first.stamps_ns["ATTITUDE"] // MS).tolist() == [19_960, 20_000]
+    assert (second.stamps_ns["ATTITUDE"] // MS).tolist() == [30_000, 30_040]
+
+
+def test_a_radio_silent_for_a_minute_is_no_reboot(frames_of: FramesOf) -> None:
+    messages = [(HOST_NS, heartbeat()), (HOST_NS, attitude(20_000)), (HOST_NS + 62_000 * MS, attitude(80_000))]
+    assert len(autopilot.boots(frames_of(messages))) == 1
+
+
 def test_what_comes_before_the_first_stamp_has_that_stamp(frames_of: FramesOf) -> None:
     (boot,) = autopilot.boots(frames_of([(HOST_NS, heartbeat()), (HOST_NS, raw_imu(5)), (HOST_NS, attitude(70_000))]))
     assert boot.stamps_ns["HEARTBEAT"].tolist() == [70_000 * MS + HALF]
