@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink import mavparm
 
@@ -68,6 +68,7 @@ def test_a_wrong_line_is_one_sentence_with_its_place(text: str, sentence: str) -
         parse(text, "x")
 
 
+@settings(deadline=None)
 @given(st.text())
 def test_any_text_is_parameters_or_a_named_error(text: str) -> None:
     with contextlib.suppress(SwathError):
