@@ -14,6 +14,11 @@ recorder     bounded backlog -> segments of the flight log, synced to the disk t
 segment      one file of the flight log, until it is read-only and in the manifest
 logfolder    names, manifest, space
 leftovers    logs that a power cut left open, mended beside the recording
+relay        live downlink: what is received goes to the ground as well, and never harms the recording
+lidar_settings  the lidar's web server: settings compared, set, verified
+parameters   files of autopilot parameters, and the comparison (pure)
+parameter_link  parameters over MAVLink: read, set, confirmed
+commands     commands of `swathd` beside recording
 worker       a thread whose progress is watched
 notify       word to systemd
 daemon       start, run, stop

@@ -3,8 +3,12 @@
 import contextlib
 import importlib.util
 import io
+import os
 import random
+import select
+import socket
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -239,6 +243,35 @@ def test_a_parameter_that_keeps_its_value_is_told_of(
         pytest.raises(SourceError, match="A was set to 2 2 times, the autopilot keeps 1"),
     ):
         link.apply([Difference("A", 2.0, 1.0)])
+
+
+def test_a_link_by_udp_does_as_well(autopilot: Callable[..., Any], free_port: int) -> None:
+    """As a MAVLink router hands it on: its bytes come from a port that answers go back to."""
+    board = autopilot(small(), version=2)
+    device, end = os.open(board.device, os.O_RDWR | os.O_NOCTTY), threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+
+        def route() -> None:
+            sock.setblocking(False)
+            while not end.is_set():
+                for ready in select.select([device, sock], [], [], 0.05)[0]:
+                    if ready is sock:
+                        with contextlib.suppress(ConnectionRefusedError):
+                            os.write(device, sock.recv(65536))
+                    else:
+                        sock.sendto(os.read(device, 4096), ("127.0.0.1", free_port))
+
+        router = threading.Thread(target=route)
+        router.start()
+        try:
+            with ParameterLink(LinkConfig(f"udp:127.0.0.1:{free_port}")) as link:
+                wanted = parse("A,9\nE,5", "x")
+                link.apply(compare(wanted, link.read(wanted)))
+        finally:
+            end.set()
+            router.join()
+            os.close(device)
+    assert board.parameters["A"] == [9, UINT8]
 
 
 def test_silence_is_one_sentence(tmp_path: Path, free_port: int) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 import pytest
+import velodyne_decoder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -107,6 +108,23 @@ def test_as_many_turns_make_a_whole_scan_and_every_turn_shows_its_share(thin: in
     assert abs(chosen.mean() - 1 / thin) < 0.02
     turn = np.arange(len(azimuth)) // 181
     assert (np.bincount(turn[chosen], minlength=thin) > 0).all()
+
+
+@pytest.mark.parametrize("thin", [2, 4, 6])
+def test_a_viewer_sees_one_scan_a_turn_however_thin_each_with_its_share(thin: int) -> None:
+    """velodyne-decoder cuts the thinned stream as it cuts the whole one."""
+    made = packets(181 * 12)["data"]
+    made["blocks"]["returns"]["range"] = 2500  # 5 m
+    chosen = Thinner(thin).choose(made["blocks"]["azimuth"][:, 0])
+    decoder = velodyne_decoder.StreamDecoder(velodyne_decoder.Config(model=velodyne_decoder.Model.HDL32E))
+    scans = []
+    for packet in made[chosen]:
+        if (scan := decoder.decode(1000.0 + packet["stamp_us"] * 553e-6, packet.tobytes(), True)) is not None:
+            scans.append(len(scan[1]))
+    assert 10 <= len(scans) <= 12
+    whole = 181 * 12 * 32
+    # sectors of 10 deg are cut between packets of 2 deg: one more or less of 36 / thin
+    assert all(abs(points / whole - 1 / thin) < 1.2 / 36 for points in scans)
 
 
 def test_thinning_by_one_keeps_everything() -> None:
