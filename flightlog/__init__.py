@@ -34,13 +34,18 @@ salvage                       a whole log out of a cut or damaged one
 container, mcapwriter, walk   the records of an MCAP file; writing them; the way through a damaged one
 """
 
-from importlib.metadata import PackageNotFoundError, version
-
-from flightlog.records import FORMAT_VERSION
-
-try:
-    __version__ = version("swath")
-except PackageNotFoundError:  # a source tree that is not installed
-    __version__ = "0+unknown"
+from flightlog.constants import FORMAT_VERSION
 
 __all__ = ["FORMAT_VERSION", "__version__"]
+
+
+def __getattr__(name: str) -> str:
+    """The version, looked up when it is asked for: that takes longer than all of a short command."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("swath")
+    except PackageNotFoundError:  # a source tree that is not installed
+        return "0+unknown"

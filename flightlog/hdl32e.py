@@ -11,12 +11,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flightlog.constants import HDL32E_DATA_PORT, HDL32E_POSITION_PORT
 from flightlog.errors import PacketError, WrongSensorError
 
-DATA_PORT: Final = 2368
-"""UDP port of the data packets (M-A p. 5)."""
-POSITION_PORT: Final = 8308
-"""UDP port of the position packets (M-A p. 5)."""
+DATA_PORT: Final = HDL32E_DATA_PORT
+POSITION_PORT: Final = HDL32E_POSITION_PORT
 DATA_BYTES: Final = 1206
 POSITION_BYTES: Final = 512
 

@@ -13,12 +13,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flightlog.constants import FORMAT_VERSION as FORMAT_VERSION
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.hdl32e import DATA_BYTES, DATA_DTYPE, POSITION_BYTES, POSITION_DTYPE
-
-FORMAT_VERSION: Final = 1
-"""Raised when a reader of the old version would misread a new log."""
 
 _CDR_LE: Final = b"\x00\x01\x00\x00"
 _RULE: Final = "=" * 80

@@ -2,18 +2,12 @@
 
 import argparse
 import faulthandler
-import os
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from flightlog import __version__
 from flightlog.errors import SwathError
-from onboard.commands import gate, install, lidar, parameters, uninstall
-
-_CONFIG = Path("/etc/swathd/swathd.yaml")
-_RUNTIME = Path("/run/swathd")
+from onboard.commands import gate, health, install, lidar, parameters, uninstall
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swathd", description="Records the lidar and the autopilot to a flight log.")
-    parser.add_argument("--version", action="version", version=f"swathd {__version__}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="record until told to stop")
@@ -38,12 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     sample = commands.add_parser("config", help="print a configuration file with every option and its default")
     sample.set_defaults(command=_sample)
 
-    health = commands.add_parser("health", help="say how it goes; exit code 0 good, 1 warning, 2 critical")
-    _add_config(health)
-    health.add_argument("--json", action="store_true", help="the whole status, with the verdict")
-    health.set_defaults(command=_health)
-
-    for command in (lidar, parameters, install, uninstall, gate):
+    for command in (health, lidar, parameters, install, uninstall, gate):
         name = command.__name__.rpartition(".")[2]
         child = commands.add_parser(name, help=command.HELP, description=command.HELP)
         command.add_arguments(child)
@@ -51,9 +40,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+class _Version(argparse.Action):
+    """Looked up only when asked for: that takes as long as all the rest of a short command."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from flightlog import __version__
+
+        print(f"swathd {__version__}")
+        parser.exit()
+
+
 def _add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--config", type=Path, default=_CONFIG, metavar="FILE", help=f"configuration (default {_CONFIG})"
+        "--config", type=Path, default=health.CONFIG, metavar="FILE", help=f"configuration (default {health.CONFIG})"
     )
 
 
@@ -73,38 +72,6 @@ def _sample(options: argparse.Namespace) -> int:
     del options
     print(sample(SwathdConfig), end="")
     return 0
-
-
-def _health(options: argparse.Namespace) -> int:
-    import json
-
-    from onboard import config, health
-
-    # the configuration of the installed service goes with the service's own folder
-    folder = str(_RUNTIME) if options.config == _CONFIG and _RUNTIME.is_dir() else None
-    path = config.load(options.config).status_path(os.environ.get("RUNTIME_DIRECTORY", folder))
-    try:
-        text = path.read_text(encoding="utf-8")
-        status = health.from_json(text, str(path))
-    except (OSError, UnicodeDecodeError, SwathError) as error:
-        # not knowing is as bad as it gets, and a monitor reads the exit code
-        reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
-        print(f"{health.Level.CRITICAL.name}: {reason}")
-        return int(health.Level.CRITICAL)
-    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    now_ns = time.monotonic_ns()
-    verdict = health.judge(status, now_ns, boot_id)
-    if options.json:
-        tree = {
-            "verdict": verdict.level.name,
-            "findings": verdict.findings,
-            "armed": health.armed(status, now_ns, boot_id),
-            "status": json.loads(text),
-        }
-        print(json.dumps(tree, indent=1))
-    else:
-        print("\n".join(health.report(status, verdict)))
-    return int(verdict.level)
 
 
 if __name__ == "__main__":

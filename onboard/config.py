@@ -5,9 +5,9 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Final
 
-from flightlog import config, records
+from flightlog import config
 from flightlog.config import option
-from flightlog.hdl32e import DATA_PORT, POSITION_PORT
+from flightlog.constants import HDL32E_DATA_PORT, HDL32E_POSITION_PORT
 
 _UDP: Final = "udp:"
 
@@ -27,8 +27,8 @@ class LidarConfig:
     """The HDL-32E's two UDP ports."""
 
     address: str = option("0.0.0.0", "local address to listen on; 0.0.0.0 also takes broadcasts")
-    data_port: int = option(DATA_PORT, "port of the data packets", minimum=1, maximum=65535)
-    position_port: int = option(POSITION_PORT, "port of the position packets", minimum=1, maximum=65535)
+    data_port: int = option(HDL32E_DATA_PORT, "port of the data packets", minimum=1, maximum=65535)
+    position_port: int = option(HDL32E_POSITION_PORT, "port of the position packets", minimum=1, maximum=65535)
     receive_buffer_kb: int = option(
         8192, "kernel receive buffer; 8192 bridges a stall of 4 s [kB]", minimum=16, maximum=262144
     )
@@ -131,8 +131,8 @@ class DownlinkConfig:
     """What goes to the ground live, as UDP; it never harms the recording."""
 
     address: str | None = option(None, "IP address on the ground, a broadcast address too; null: there is no downlink")
-    lidar_port: int = option(DATA_PORT, "port of the data packets there", minimum=1, maximum=65535)
-    position_port: int = option(POSITION_PORT, "port of the position packets there", minimum=1, maximum=65535)
+    lidar_port: int = option(HDL32E_DATA_PORT, "port of the data packets there", minimum=1, maximum=65535)
+    position_port: int = option(HDL32E_POSITION_PORT, "port of the position packets there", minimum=1, maximum=65535)
     mavlink_port: int = option(14550, "port of the ground station there", minimum=1, maximum=65535)
     mavlink: str = option("ins", "whose bytes go there", choices=("ins", "fc", "none"))
     thin: int = option(
@@ -153,6 +153,8 @@ class DownlinkConfig:
 
     def ports(self) -> dict[str, int]:
         """Port of each topic that goes down."""
+        from flightlog import records  # not for those who only ask for the status file
+
         ports = {records.LIDAR.topic: self.lidar_port, records.POSITION.topic: self.position_port}
         if self.mavlink != "none":
             ports[records.MAVLINK.topic + self.mavlink] = self.mavlink_port

@@ -1,0 +1,76 @@
+"""`swathd health`: what the status file says, judged. It is asked over SSH, so it loads nothing that takes time."""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Final
+
+from flightlog.errors import SwathError
+from onboard import health
+from onboard.health import Level
+
+HELP = "say how it goes; exit code 0 good, 1 warning, 2 critical"
+
+CONFIG: Final = Path("/etc/swathd/swathd.yaml")
+_RUNTIME: Final = Path("/run/swathd")
+_WATCH_S: Final = 1.0
+_CLEAR: Final = "\x1b[H\x1b[J"
+"""Cursor home, erase what follows (ECMA-48)."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument("--config", type=Path, default=CONFIG, metavar="FILE", help=f"configuration (default {CONFIG})")
+    parser.add_argument("--json", action="store_true", help="the whole status, with the verdict")
+    parser.add_argument("--watch", action="store_true", help="again every second, until interrupted")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the health; gives the exit code, with --watch that of the last look."""
+    path = _status_path(options.config)
+    level, text = look(path, as_json=options.json)
+    if not options.watch:
+        print(text)
+        return int(level)
+    try:
+        while True:
+            print(text if options.json else _CLEAR + text, flush=True)
+            time.sleep(_WATCH_S)
+            level, text = look(path, as_json=options.json)
+    except KeyboardInterrupt:
+        return int(level)
+
+
+def _status_path(config_path: Path) -> Path:
+    from onboard import config
+
+    # the configuration of the installed service goes with the service's own folder
+    folder = str(_RUNTIME) if config_path == CONFIG and _RUNTIME.is_dir() else None
+    return config.load(config_path).status_path(os.environ.get("RUNTIME_DIRECTORY", folder))
+
+
+def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
+    """The verdict on a status file, and the text that tells it."""
+    try:
+        content = path.read_text(encoding="utf-8")
+        status = health.from_json(content, str(path))
+    except (OSError, UnicodeDecodeError, SwathError) as error:
+        # not knowing is as bad as it gets, and a monitor reads the exit code
+        reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
+        if as_json:
+            return Level.CRITICAL, json.dumps({"verdict": Level.CRITICAL.name, "findings": [reason]}, indent=1)
+        return Level.CRITICAL, f"{Level.CRITICAL.name}: {reason}"
+    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    now_ns = time.monotonic_ns()
+    verdict = health.judge(status, now_ns, boot_id)
+    if not as_json:
+        return verdict.level, "\n".join(health.report(status, verdict))
+    tree = {
+        "verdict": verdict.level.name,
+        "findings": verdict.findings,
+        "armed": health.armed(status, now_ns, boot_id),
+        "status": json.loads(content),
+    }
+    return verdict.level, json.dumps(tree, indent=1)
