@@ -104,7 +104,7 @@ def georeference(
         Default: the manual's.
     """
     data = packets["data"] if packets.dtype.names and "data" in packets.dtype.names else packets
-    raw, dual = decode.raw_bytes(packets), decode.is_dual(data)
+    (raw, head), dual = decode.raw_bytes(packets), decode.is_dual(data)
     lasers = lasers or LaserTable.nominal()
     sensor, covered = sensor_poses(time_ns, BLOCKS // 2 if dual else BLOCKS, trajectory, mount)
     size = len(raw) * BLOCKS * LASERS
@@ -120,7 +120,7 @@ def georeference(
     limits = (gate or Gate()).steps()
     place = _place_dual if dual else _place_single
     counters = np.zeros(4, np.int64)
-    count = place(raw, time_ns, table, *limits, covered, sensor, out, counters)
+    count = place(raw, head, time_ns, table, *limits, covered, sensor, out, counters)
     stamps, xyz, ranges, intensity, laser, returns = out
     return Points(
         stamps[:count],
@@ -212,6 +212,7 @@ def _fill(ends: Any, known: Any, firings: int, out: Any, covered: Any) -> None:
 @njit(cache=True, nogil=True, fastmath=True)
 def _place_single(
     raw: Any,
+    head: int,
     time_ns: Any,
     lasers: Any,
     start: float,
@@ -227,15 +228,15 @@ def _place_single(
     count = 0
     steps, directions = np.empty(BLOCKS), np.empty((2, LASERS))
     for packet in range(raw.shape[0]):
-        row = raw[packet]
-        step = decode.azimuth_step(raw, packet, 1, steps)
+        row = raw[packet, head:]
+        step = decode.azimuth_step(row, 1, steps)
         decode.laser_directions(step, lasers, directions)
         for block in range(BLOCKS):
             if not covered[packet * BLOCKS + block]:
                 counters[0] += LASERS
                 continue
             pose = sensor[packet * BLOCKS + block]
-            azimuth = float(decode.u16(raw, packet, block * _BLOCK_BYTES + 2) % 36_000)
+            azimuth = float(decode.u16(row, block * _BLOCK_BYTES + 2) % 36_000)
             if decode.block_is_outside(azimuth, step, start, width):
                 counters[1] += LASERS
                 continue
@@ -249,7 +250,7 @@ def _place_single(
             at = block * _BLOCK_BYTES + 1
             for k in range(LASERS):
                 at += 3
-                range_steps = np.int64(row[at]) | (np.int64(row[at + 1]) << 8)
+                range_steps = decode.u16(row, at)
                 if not inside and (azimuth + step * decode.LASER_FRACTION * k - start) % decode.AZIMUTH_TURN > width:
                     counters[1] += 1
                     continue
@@ -273,6 +274,7 @@ def _place_single(
 @njit(cache=True, nogil=True, fastmath=True)
 def _place_dual(
     raw: Any,
+    head: int,
     time_ns: Any,
     lasers: Any,
     start: float,
@@ -288,15 +290,15 @@ def _place_dual(
     count = 0
     steps, directions = np.empty(BLOCKS), np.empty((2, LASERS))
     for packet in range(raw.shape[0]):
-        row = raw[packet]
-        step = decode.azimuth_step(raw, packet, 2, steps)
+        row = raw[packet, head:]
+        step = decode.azimuth_step(row, 2, steps)
         decode.laser_directions(step, lasers, directions)
         for firing in range(BLOCKS // 2):
             if not covered[packet * (BLOCKS // 2) + firing]:
                 counters[0] += LASERS
                 continue
             pose = sensor[packet * (BLOCKS // 2) + firing]
-            azimuth = float(decode.u16(raw, packet, 2 * firing * _BLOCK_BYTES + 2) % 36_000)
+            azimuth = float(decode.u16(row, 2 * firing * _BLOCK_BYTES + 2) % 36_000)
             if decode.block_is_outside(azimuth, step, start, width):
                 counters[1] += LASERS
                 continue
@@ -317,7 +319,7 @@ def _place_dual(
                     counters[3 if row[last] or row[last + 1] else 2] += 1
                 for number in range(returns):
                     at = first if number == 0 else second
-                    range_steps = np.int64(row[at]) | (np.int64(row[at + 1]) << 8)
+                    range_steps = decode.u16(row, at)
                     distance = range_steps * RANGE_LSB_M + lasers[2, k]
                     p, q, r = distance * directions[0, k], distance * directions[1, k], distance * lasers[1, k]
                     out_time[count] = firing_ns + k * LASER_NS
@@ -332,12 +334,24 @@ def _place_dual(
     return count
 
 
-@njit(cache=True, nogil=True)
-def _project(xyz: Any, centre: Any, c: Any) -> None:
+@njit(cache=True, nogil=True, fastmath=True)
+def _project(xyz: Any, centre: Any, coefficients: Any) -> None:
     for i in range(xyz.shape[0]):
         e, n, u = xyz[i, 0] - centre[0], xyz[i, 1] - centre[1], xyz[i, 2] - centre[2]
         for axis in range(3):
-            linear = c[axis, 0] + c[axis, 1] * e + c[axis, 2] * n + c[axis, 3] * u
-            square = c[axis, 4] * e * e + c[axis, 5] * n * n + c[axis, 6] * u * u
-            mixed = c[axis, 7] * e * n + c[axis, 8] * e * u + c[axis, 9] * n * u
-            xyz[i, axis] = linear + square + mixed
+            c = coefficients[axis]
+            of_east = c[1] + c[4] * e + c[7] * n + c[8] * u
+            of_north = c[2] + c[5] * n + c[9] * u
+            of_up = c[3] + c[6] * u
+            xyz[i, axis] = c[0] + e * of_east + n * of_north + u * of_up
+
+
+@njit(cache=True, nogil=True)
+def extent(xyz_m: Any) -> Any:
+    """Least and largest coordinates of points, shape (n, 3): two arrays of shape (3,). numpy takes twice as long."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for i in range(xyz_m.shape[0]):
+        for axis in range(3):
+            low[axis] = min(low[axis], xyz_m[i, axis])
+            high[axis] = max(high[axis], xyz_m[i, axis])
+    return low, high

@@ -189,13 +189,22 @@ class BatchJoiner:
         """Give the last batch."""
         if not self._packets and self._account is None:
             return []
-        packets = np.concatenate([np.empty(0, records.SCAN_PACKET_DTYPE), *self._packets])
+        packets = joined(self._packets)
         account, self._packets, self._account = self._account, [], None
         receive_ns = records.receive_time_ns(packets)
         if not len(packets):
             return [LidarBatch(self._log_time_ns, packets, receive_ns, receive_ns, account)]
         device_ns, jumped = self.device.extend(packets["data"]["stamp_us"], receive_ns)
         return [LidarBatch(self._log_time_ns, packets, receive_ns, device_ns, account, jumped)]
+
+
+def joined(parts: Sequence[npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
+    """Packets of SCAN_PACKET_DTYPE in one array, shape (n,); a single part as it is."""
+    if len(parts) == 1:
+        return parts[0]
+    # as bytes: numpy copies records field by field
+    raw = [part.view(np.uint8) for part in parts]
+    return np.concatenate([np.empty(0, np.uint8), *raw]).view(records.SCAN_PACKET_DTYPE)
 
 
 def position_samples(readers: Sequence[LogReader], progress: Progress | None = None) -> PositionSamples:

@@ -1,4 +1,4 @@
-"""Clouds as LAZ: LAS 1.4, point format 6, compressed on all cores behind the caller's back."""
+"""Clouds as LAZ: LAS 1.4, point format 6, compressed on all cores."""
 
 import queue
 import threading
@@ -14,14 +14,18 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 from laspy.vlrs.known import WktCoordinateSystemVlr
+from numba import njit
 
 from flightlog import __version__, clock
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SourceError
 
 SCALE_M: Final = 0.001
-_QUEUE: Final = 3
-"""Chunks that may wait for the compressor: bounded memory, and the producer never idle."""
+_BUFFERS: Final = 3
+"""One is filled while another is compressed and the third waits: bounded memory, and neither side idle for long."""
+_BUFFER_POINTS: Final = 20 * 50_000
+"""lazrs compresses 50,000 points at a time on each core: a call of many such leaves no core idle at its end."""
+_INT32: Final = np.iinfo(np.int32)
 _ADJUSTED_S: Final = 1_000_000_000
 """Adjusted standard GPS time is GPS time less this (LAS 1.4 R15, global encoding bit 0)."""
 
@@ -50,7 +54,7 @@ def gps_time_s(utc_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
 
 
 class CloudWriter:
-    """Writes one LAZ file, chunk by chunk, from a thread of its own.
+    """Writes one LAZ file, compressed by a thread of its own.
 
     Use as a context manager: the file is complete when it is left, and an error inside leaves none behind (the caller writes aside).
 
@@ -78,7 +82,7 @@ class CloudWriter:
         gps: bool = True,
         about: str = "Velodyne HDL-32E",
     ) -> None:
-        header = _Header(version="1.4", point_format=6)
+        header = laspy.LasHeader(version="1.4", point_format=6)
         header.add_extra_dims([_extra(extra) for extra in extras])
         header.scales, header.offsets = np.full(3, SCALE_M), np.asarray(offset_m, np.float64)
         header.generating_software, header.system_identifier = f"swath {__version__}"[:31], about[:31]
@@ -95,9 +99,15 @@ class CloudWriter:
             )
         except OSError as error:
             raise SourceError(f"{path}: cannot be written ({error.strerror})") from None
-        self._header = header
-        self._dtype = header.point_format.dtype()
-        self._chunks: queue.Queue[npt.NDArray[np.void] | None] = queue.Queue(_QUEUE)
+        self._offset_m = np.asarray(offset_m, np.float64)
+        self._limits = np.array([[_INT32.max] * 3, [_INT32.min] * 3], np.int64)
+        self._by_return = np.zeros(16, np.int64)
+        dtype = header.point_format.dtype()
+        self._filling, self._used = np.zeros(_BUFFER_POINTS, dtype), 0
+        self._full: queue.SimpleQueue[npt.NDArray[np.void] | None] = queue.SimpleQueue()
+        self._free: queue.SimpleQueue[npt.NDArray[np.void]] = queue.SimpleQueue()
+        for _ in range(_BUFFERS - 1):
+            self._free.put(np.zeros(_BUFFER_POINTS, dtype))
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._compress, name="laz", daemon=True)
         self._thread.start()
@@ -109,9 +119,11 @@ class CloudWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._chunks.put(None)
+        self._full.put(self._filling[: self._used])
+        self._full.put(None)
         self._thread.join()
         if self._error is None:
+            self._state_totals(self._las.header)
             self._las.close()
         else:
             self._las.dest.close()
@@ -127,47 +139,56 @@ class CloudWriter:
         extras: Mapping[str, npt.NDArray[Any]],
     ) -> None:
         """Append points, shape (n, 3) and (n,); extras are the stored numbers, by name."""
-        if self._error is not None:
-            raise self._error
-        if not len(xyz_m):
-            return
-        points = np.zeros(len(xyz_m), self._dtype)
-        offsets = self._header.offsets
-        for axis, name in enumerate("XYZ"):
-            points[name] = np.rint((xyz_m[:, axis] - offsets[axis]) * (1.0 / SCALE_M))
-        points["gps_time"] = time_s
-        points["intensity"] = intensity
-        points["bit_fields"] = returns  # return number in the low half, number of returns in the high: as in LAS
-        for name, values in extras.items():
-            points[name] = values
-        self.points += len(points)
-        self._chunks.put(points)
+        start = 0
+        while start < len(xyz_m):
+            if self._error is not None:
+                raise self._error
+            count = min(len(xyz_m) - start, _BUFFER_POINTS - self._used)
+            part, place = slice(start, start + count), slice(self._used, self._used + count)
+            out = self._filling[place]
+            # return number in the low half, number of returns in the high: bit_fields as they are in LAS
+            columns = tuple(out[name] for name in ("X", "Y", "Z", "gps_time", "intensity", "bit_fields"))
+            values = (xyz_m[part], time_s[part], intensity[part], returns[part])
+            _pack(*values, self._offset_m, columns, self._limits, self._by_return)
+            for name, stored in extras.items():
+                out[name] = stored[part]
+            start, self._used, self.points = start + count, self._used + count, self.points + count
+            if self._used == _BUFFER_POINTS:
+                self._full.put(self._filling)
+                self._filling, self._used = self._free.get(), 0
 
     def _compress(self) -> None:
-        while (points := self._chunks.get()) is not None:
-            if self._error is not None:
-                continue  # keep taking, so that the producer never waits for a dead thread
+        """Compress what is full, in order; the thread's work."""
+        while (points := self._full.get()) is not None:
             try:
-                self._las.write_points(laspy.PackedPointRecord(points, self._header.point_format))
+                # not its write_points(): that sorts all return numbers for the header, a tenth of the time of the whole pipeline
+                if self._error is None and len(points):
+                    self._las.point_writer.write_points(laspy.PackedPointRecord(points, self._las.header.point_format))
             except BaseException as error:  # handed to the producer, whatever it is
                 self._error = error
+            self._free.put(points)  # also after an error, so that the producer never waits for a dead thread
+
+    def _state_totals(self, header: laspy.LasHeader) -> None:
+        """Write extent and counts of all points into the header."""
+        header.point_count = self.points
+        header.number_of_points_by_return[:] = self._by_return[1:]
+        header.mins, header.maxs = self._limits * SCALE_M + self._offset_m
 
 
-class _Header(laspy.LasHeader):  # type: ignore[misc]  # laspy has no types that mypy would see
-    """A header that counts returns by bins: laspy sorts all of them, a tenth of the time of the whole pipeline."""
-
-    mins: npt.NDArray[np.float64]
-    maxs: npt.NDArray[np.float64]
-
-    def grow(self, points: laspy.PackedPointRecord) -> None:
-        """Take extent and counts of points."""
-        array = points.array
-        scaled = [(array[name].min(), array[name].max()) for name in "XYZ"]
-        low, high = (np.array(values) * self.scales + self.offsets for values in zip(*scaled, strict=True))
-        self.mins, self.maxs = np.minimum(self.mins, low), np.maximum(self.maxs, high)
-        counts = np.bincount(array["bit_fields"] & 0x0F, minlength=16)[1:]
-        self.number_of_points_by_return += counts.astype(self.number_of_points_by_return.dtype)
-        self.point_count += len(array)
+@njit(cache=True, nogil=True)
+def _pack(
+    xyz_m: Any, time_s: Any, intensity: Any, returns: Any, offset_m: Any, columns: Any, limits: Any, by_return: Any
+) -> None:
+    """Fill columns of points; widen the limits of the stored coordinates, shape (2, 3), and count the returns, shape (16,)."""
+    out_x, out_y, out_z, out_time, out_intensity, out_returns = columns
+    for i in range(len(returns)):
+        for axis, out in ((0, out_x), (1, out_y), (2, out_z)):
+            value = np.int64(np.rint((xyz_m[i, axis] - offset_m[axis]) * (1.0 / SCALE_M)))
+            out[i] = value
+            limits[0, axis] = min(limits[0, axis], value)
+            limits[1, axis] = max(limits[1, axis], value)
+        out_time[i], out_intensity[i], out_returns[i] = time_s[i], intensity[i], returns[i]
+        by_return[returns[i] & 0x0F] += 1
 
 
 def _extra(extra: ExtraBytes) -> laspy.ExtraBytesParams:

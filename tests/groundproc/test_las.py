@@ -111,7 +111,7 @@ def test_an_error_of_the_compressor_reaches_the_writer_and_leaves_no_thread(
 
     def fill() -> None:
         with CloudWriter(tmp_path / "a.laz", [LASER]) as cloud:
-            monkeypatch.setattr(cloud._las, "write_points", full)
+            monkeypatch.setattr(cloud._las.point_writer, "write_points", full)
             for _ in range(50):
                 cloud.write(np.zeros((1000, 3)), np.zeros(1000), one, one, {"laser": one})
 
