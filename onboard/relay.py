@@ -234,7 +234,8 @@ class Relay(Worker):
                     self._bursts.popleft()
         except OSError as error:
             if error.errno not in _FULL:
-                self._tell(f"{self._address} cannot be sent to ({error.strerror})")
+                hint = "; IPAddressAllow= of the service must name it" if error.errno == errno.EPERM else ""
+                self._tell(f"{self._address} cannot be sent to ({error.strerror}{hint})")
                 self._close()
                 self._retry_s = now_s + _RETRY_S
         return tokens

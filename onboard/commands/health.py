@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the health; gives the exit code, with --watch that of the last look."""
-    path = _status_path(options.config)
+    path = status_path(options.config)
     level, text = look(path, as_json=options.json)
     if not options.watch:
         print(text)
@@ -43,7 +43,8 @@ def run(options: argparse.Namespace) -> int:
         return int(level)
 
 
-def _status_path(config_path: Path) -> Path:
+def status_path(config_path: Path) -> Path:
+    """Where the swathd of a configuration leaves its status."""
     from onboard import config
 
     # the configuration of the installed service goes with the service's own folder

@@ -5,6 +5,8 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from onboard.commands.health import CONFIG
+
 if TYPE_CHECKING:
     from onboard.lidar_settings import LidarSettings, LidarWeb
 
@@ -16,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("show", "apply"), help="compare only, or set, save and verify")
     parser.add_argument("--settings", type=Path, metavar="FILE", help="settings wanted (default: hdl32e.yaml of swath)")
     parser.add_argument("--address", metavar="IP[:PORT]", help="where the lidar is (default: as the settings say)")
+    parser.add_argument("--config", type=Path, default=CONFIG, metavar="FILE", help="configuration of the swathd here")
     parser.add_argument("--yes", action="store_true", help="apply without asking")
 
 
@@ -33,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
     print("\n".join(map(str, differences)) or "all settings are as wanted")
     if not differences or options.action == "show":
         return int(bool(differences))
+    _refuse_if_armed(options.config)
     if not agreed(f"set {len(differences)} of them in the lidar at {wanted.address}", options.yes):
         return 1
     web.apply(differences)
@@ -51,6 +55,24 @@ def _wanted(path: Path | None) -> "LidarSettings":
         return config.load(path, LidarSettings)
     shipped = importlib.resources.files("firmware_config").joinpath("hdl32e.yaml")
     return config.loads(shipped.read_text(encoding="utf-8"), LidarSettings, "firmware_config/hdl32e.yaml")
+
+
+def _refuse_if_armed(config: Path) -> None:
+    """UsageError where a running swathd knows that the vehicle is armed: a head that changes its speed is no scanner.
+
+    On the bench there may be no autopilot, nor a swathd: not knowing is no reason to refuse.
+    """
+    import json
+
+    from flightlog.errors import SwathError, UsageError
+    from onboard.commands.health import look, status_path
+
+    try:
+        _, text = look(status_path(config), as_json=True)
+    except SwathError:  # not configured
+        return
+    if json.loads(text).get("armed"):
+        raise UsageError("the vehicle is armed; the lidar is set only while it is not")
 
 
 def _who(web: "LidarWeb") -> str:

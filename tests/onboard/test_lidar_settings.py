@@ -5,6 +5,7 @@ import importlib.util
 import io
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -16,6 +17,7 @@ from flightlog import config
 from flightlog.errors import ConfigError, SourceError
 from onboard import lidar_settings
 from onboard.cli import main
+from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status, to_json
 from onboard.lidar_settings import FovSetting, LidarSettings, LidarWeb, compare
 
 
@@ -113,6 +115,22 @@ def test_nothing_is_changed_without_a_yes(
     assert main(["lidar", "apply", "--address", sensor.address]) == 2
     assert "nothing was changed: say --yes to set 2 of them" in capsys.readouterr().err
     assert sensor.posts == []
+
+
+@pytest.mark.parametrize(("armed", "code"), [(True, 2), (False, 0), (None, 0)])
+def test_a_vehicle_that_is_armed_keeps_its_lidar_as_it_is(
+    lidar: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], armed: bool | None, code: int
+) -> None:
+    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    link = LinkStatus(connected=True, age_s=0.1, armed=armed)
+    status = Status(time.monotonic_ns(), boot_id, "", 1, 1.0, 0, LidarStatus(), {"ins": link}, RecorderStatus())
+    (tmp_path / "status.json").write_text(to_json(status))
+    (tmp_path / "swathd.yaml").write_text(f"recorder: {{directory: {tmp_path}}}")
+    sensor = lidar()
+    words = ["lidar", "apply", "--yes", "--address", sensor.address, "--config", str(tmp_path / "swathd.yaml")]
+    assert main(words) == code
+    assert bool(sensor.posts) == (code == 0)
+    assert ("the vehicle is armed" in capsys.readouterr().err) == (code == 2)
 
 
 def test_a_slow_sensor_is_waited_for_and_a_deaf_one_told_of(lidar: Callable[..., Any]) -> None:
