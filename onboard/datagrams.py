@@ -130,11 +130,17 @@ class Receiver:
         self._messages["iov_count"] = 1
         self._messages["control"] = self._control.ctypes.data + index * np.uint64(_CONTROL_DTYPE.itemsize)
         self._messages["control_size"] = _CONTROL_DTYPE.itemsize
+        # Made once: a field of a structured array and an address take longer to get than most of what is done with them.
+        self._address = int(self._messages.ctypes.data)
+        self._message_size, self._message_flags = self._messages["size"], self._messages["flags"]
+        self._control_size = self._messages["control_size"]
+        self._stamp_s, self._stamp_part_ns = self._control["sec"], self._control["nanosec"]
+        self._sources = self._names["address"]
 
     @property
     def sources(self) -> npt.NDArray[np.uint32]:
         """IPv4 address of each datagram's sender, shape (n,)."""
-        return np.asarray(self._names["address"], np.uint32)
+        return self._sources
 
     def filter(self, payload_bytes: int, source: int) -> None:
         """Have the kernel refuse all but datagrams of one length from one IPv4 address."""
@@ -154,7 +160,7 @@ class Receiver:
         if self._is_filtered:
             self.count_last_drops()
         room = len(self._slots) - first
-        address = self._messages.ctypes.data + first * _MESSAGE_DTYPE.itemsize
+        address = self._address + first * _MESSAGE_DTYPE.itemsize
         count = int(_libc.recvmmsg(self._sock.fileno(), address, room, socket.MSG_DONTWAIT, None))
         if count <= 0:
             error = ctypes.get_errno() if count < 0 else 0
@@ -165,19 +171,17 @@ class Receiver:
         return count
 
     def _note(self, part: slice) -> None:
-        messages, control = self._messages[part], self._control[part]
-        self.sizes[part] = messages["size"]
-        cut = messages["flags"] & socket.MSG_TRUNC
-        if cut.any():
-            self.sizes[part][cut != 0] = self._limit + 1
-        control_size = messages["control_size"]
-        stamps_ns = control["sec"] * NS_PER_S
-        stamps_ns += control["nanosec"]
+        self.sizes[part] = self._message_size[part]
+        flags = self._message_flags[part]
+        if int(np.bitwise_or.reduce(flags)) & socket.MSG_TRUNC:
+            self.sizes[part][flags & socket.MSG_TRUNC != 0] = self._limit + 1
+        control_size = self._control_size[part]
+        stamps_ns = np.multiply(self._stamp_s[part], NS_PER_S, out=self.stamps_ns[part])
+        stamps_ns += self._stamp_part_ns[part]
         if control_size.min() < _WITH_TIME:
             stamps_ns[control_size < _WITH_TIME] = 0
-        self.stamps_ns[part] = stamps_ns
         if control_size[-1] >= _WITH_DROPS and not self._is_filtered:
-            self._count_drops(int(control["drops"][-1]), is_lost=True)
+            self._count_drops(int(self._control["drops"][part][-1]), is_lost=True)
         control_size[:] = _CONTROL_DTYPE.itemsize
 
     def count_last_drops(self) -> None:

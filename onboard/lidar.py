@@ -107,7 +107,7 @@ class LidarPort(Worker):
         self._heard_ns = time.monotonic_ns()
         self._seen = np.zeros(SECTORS, np.bool_)
         self.clock = Envelope(HOUR_NS, _STAMP_NS)
-        self._newest: npt.NDArray[np.void] | None = None
+        self._newest = b""
         self.window = Window.from_degrees(config.fov.start_deg, config.fov.end_deg)
         self._put = put
         buffer_bytes = config.receive_buffer_kb * 1024
@@ -194,7 +194,9 @@ class LidarPort(Worker):
     def view(self) -> SensorView | None:
         """How the lidar is set, by what came since this was last asked; None: nothing came."""
         seen, self._seen = self._seen, np.zeros(SECTORS, np.bool_)
-        return None if self._newest is None or not seen.any() else view(self._newest, seen)
+        if not self._newest or not seen.any():
+            return None
+        return view(np.frombuffer(self._newest, SCAN_PACKET_DTYPE)["data"], seen)
 
     def _adopt(self, sources: npt.NDArray[np.uint32]) -> None:
         """Take the sender of most good packets for the lidar, and have the kernel refuse all others."""
@@ -207,7 +209,7 @@ class LidarPort(Worker):
         assert self._sensor is not None
         self._heard_ns = time.monotonic_ns()
         self._seen |= sectors_seen(packets["data"])
-        self._newest = packets["data"][-1:].copy()
+        self._newest = packets[-1:].tobytes()
         self.counts.good += len(packets)
         stamp_ns = packets["data"]["stamp_us"].astype(np.int64) * NS_PER_US
         first = int(np.argmax(stamp_ns - time_ns))  # the one that was on its way the shortest

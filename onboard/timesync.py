@@ -97,10 +97,12 @@ class KernelTime:
             [ns of log time], never later than now nor earlier than the poll before the last.
         """
         offset_ns = stepped_offset_ns(stamps_ns, self._before, now)
-        monotonic_ns = np.clip(stamps_ns - offset_ns, self._earlier.monotonic_ns, now.monotonic_ns)
+        monotonic_ns: npt.NDArray[np.int64] = np.maximum(stamps_ns - offset_ns, self._earlier.monotonic_ns)
+        np.minimum(monotonic_ns, now.monotonic_ns, out=monotonic_ns)
         if emptied:
             self._earlier, self._before = self._before, now
-        return np.asarray(monotonic_ns + self._log_time.anchor_ns)
+        monotonic_ns += self._log_time.anchor_ns
+        return monotonic_ns
 
 
 def stepped_offset_ns(stamps_ns: npt.NDArray[np.int64], before: Clocks, now: Clocks) -> npt.NDArray[np.int64] | int:
