@@ -1,16 +1,16 @@
 """What of a flight fits in memory: autopilot, lidar gyros, clocks; everything but the lidar's packets."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from flightlog import nmea
+from flightlog import nmea, records
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
-from flightlog.mavlink import FrameParser
+from flightlog.mavlink import Frame, FrameParser
 from groundproc import autopilot, load, timebase
 from groundproc.autopilot import Boot
 from groundproc.load import JUMP_NS, PositionSamples
@@ -48,9 +48,9 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     LogError
         No lidar packets, or no autopilot, in the logs.
     """
-    parser = FrameParser()
+    parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers))
     count, kept = 0, []
-    for frame in load.mavlink_frames(readers, link, parser, progress):
+    for frame in _frames(readers, link, parser, samples, progress):
         count += 1
         if frame.message_id in autopilot.WANTED:  # the rest would fill the memory of an hour
             kept.append(frame)
@@ -59,10 +59,28 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
             f"{readers[0].path}: no MAVLink of the link {link!r} in the log; a trajectory needs an autopilot"
         )
     boots = autopilot.boots(kept)
-    runs = _runs(readers, load.position_samples(readers, progress))
+    runs = _runs(readers, samples.samples())
     if not runs:
         raise LogError(f"{readers[0].path}: no lidar packets in the log")
     return Flight(boots, runs, count, parser.bad_bytes, parser.unknown)
+
+
+def _frames(
+    readers: Sequence[LogReader],
+    link: str,
+    parser: FrameParser,
+    samples: load.PositionCollector,
+    progress: Progress | None,
+) -> Iterator[Frame]:
+    """The frames of a link; position packets go to `samples`, so that the logs are read once for both."""
+    for reader in load.in_order(readers):
+        for message in reader.messages((records.POSITION.topic, records.MAVLINK.topic + link), progress):
+            if message.topic == records.POSITION.topic:
+                samples.feed(message)
+                continue
+            for time_ns, data in records.decode_raw(message.data):
+                yield from parser.feed(time_ns, data)
+    yield from parser.finish()
 
 
 def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarRun]:

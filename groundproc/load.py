@@ -209,16 +209,47 @@ def joined(parts: Sequence[npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
 
 def position_samples(readers: Sequence[LogReader], progress: Progress | None = None) -> PositionSamples:
     """Read all position packets of one or several logs."""
-    device = first_stamp(readers)
-    parts = []
-    sentences: list[Sentence] = []
-    for batch in position_batches(readers, device, progress):
-        parts.append(_samples(batch))  # not the packets: 512 bytes each, for the 37 that count
-        sentences += new_sentences(batch, sentences[-1].text if sentences else "")
-    device_ns, receive_ns, gyro, accel, temperature, has_imu, pps = (
-        np.concatenate(column) for column in zip(_NO_SAMPLES, *parts, strict=True)
-    )
-    return PositionSamples(device_ns, receive_ns, gyro, accel, temperature, has_imu, pps, sentences, device.jumps)
+    collector = PositionCollector(first_stamp(readers))
+    for reader in in_order(readers):
+        for message in reader.messages((records.POSITION.topic,), progress):
+            collector.feed(message)
+    return collector.samples()
+
+
+class PositionCollector:
+    """Gathers the position packets of a flight, message by message: their columns, not the packets, 512 bytes for the 37 that count.
+
+    Parameters
+    ----------
+    device : DeviceClock
+        Of `first_stamp`.
+    """
+
+    def __init__(self, device: DeviceClock) -> None:
+        self._device = device
+        self._parts = [_NO_SAMPLES]
+        self._sentences: list[Sentence] = []
+
+    def feed(self, message: Message) -> None:
+        """Take the next message of the position topic."""
+        receive_ns, packets = records.decode_position(message.data)
+        good = hdl32e.is_position(packets)
+        receive_ns, packets = receive_ns[good], packets[good]
+        if not len(packets):
+            return
+        device_ns, _ = self._device.extend(packets["stamp_us"], receive_ns)
+        batch = PositionBatch(packets, receive_ns, device_ns)
+        self._parts.append(_samples(batch))
+        self._sentences += new_sentences(batch, self._sentences[-1].text if self._sentences else "")
+
+    def samples(self) -> PositionSamples:
+        """All that was fed."""
+        device_ns, receive_ns, gyro, accel, temperature, has_imu, pps = (
+            np.concatenate(column) for column in zip(*self._parts, strict=True)
+        )
+        return PositionSamples(
+            device_ns, receive_ns, gyro, accel, temperature, has_imu, pps, self._sentences, self._device.jumps
+        )
 
 
 def _samples(batch: "PositionBatch") -> tuple[npt.NDArray[Any], ...]:
@@ -247,20 +278,6 @@ class PositionBatch:
 _NO_SAMPLES: Final = _samples(
     PositionBatch(np.empty(0, hdl32e.POSITION_DTYPE), np.empty(0, np.int64), np.empty(0, np.int64))
 )
-
-
-def position_batches(
-    readers: Sequence[LogReader], device: DeviceClock, progress: Progress | None = None
-) -> Iterator[PositionBatch]:
-    """Stream the position packets of one or several logs."""
-    for reader in in_order(readers):
-        for message in reader.messages((records.POSITION.topic,), progress):
-            receive_ns, packets = records.decode_position(message.data)
-            good = hdl32e.is_position(packets)
-            receive_ns, packets = receive_ns[good], packets[good]
-            if len(packets):
-                device_ns, _ = device.extend(packets["stamp_us"], receive_ns)
-                yield PositionBatch(packets, receive_ns, device_ns)
 
 
 def new_sentences(batch: PositionBatch, last: str) -> list[Sentence]:
