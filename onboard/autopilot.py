@@ -210,6 +210,15 @@ class Link(Worker):
         _log.info("link %s: %s is open", self.name, self._config.device)
 
 
+def streams_asked(streams: StreamsConfig) -> list[tuple[str, int, int]]:
+    """Name and id of the message by which each stream asked for is judged, and the rate asked for [Hz]."""
+    return [
+        (dialect.mavlink_map[message].msgname, message, rate)
+        for option, _, message in _STREAMS
+        if (rate := getattr(streams, option))
+    ]
+
+
 def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
     """Count frames; those of an id we cannot verify are no sign of life."""
     for frame in frames:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flightlog.errors import SwathError
-from onboard.commands import gate, health, install, lidar, parameters, uninstall
+from onboard.commands import check, gate, health, install, lidar, parameters, uninstall
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     sample = commands.add_parser("config", help="print a configuration file with every option and its default")
     sample.set_defaults(command=_sample)
 
-    for command in (health, lidar, parameters, install, uninstall, gate):
+    for command in (health, check, lidar, parameters, install, uninstall, gate):
         name = command.__name__.rpartition(".")[2]
         child = commands.add_parser(name, help=command.HELP, description=command.HELP)
         command.add_arguments(child)

@@ -48,12 +48,12 @@ def view(packet: npt.NDArray[np.void], seen: npt.NDArray[np.bool_]) -> SensorVie
 
 
 def rpm(packet: np.void) -> float:
-    """Turns per minute from the azimuths of a packet's blocks; the median stands a gap in the field of view."""
-    azimuth = packet["blocks"]["azimuth"].astype(np.int64)[
-        np.r_[True, np.diff(firing_index(int(packet["return_mode"]))) > 0]
-    ]
+    """Turns per minute from the azimuths of a packet's blocks, but for steps over a gap in the field of view."""
+    first_of_firing = np.r_[True, np.diff(firing_index(int(packet["return_mode"]))) > 0]
+    azimuth = packet["blocks"]["azimuth"].astype(np.int64)[first_of_firing]
     steps = np.diff(azimuth) % AZIMUTH_STEPS
-    return float(np.median(steps)) / AZIMUTH_STEPS * 60 * NS_PER_S / FIRING_NS
+    usual = steps[steps <= 2 * np.median(steps)]  # azimuths are whole hundredths: a mean has more than a median
+    return float(usual.mean()) / AZIMUTH_STEPS * 60 * NS_PER_S / FIRING_NS
 
 
 def _widest(seen: npt.NDArray[np.bool_]) -> tuple[float, float]:

@@ -7,10 +7,11 @@ import socket
 import struct
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
@@ -85,3 +86,41 @@ def inside(namespace: str, make: Callable[[], T]) -> T:
     thread.start()
     thread.join()
     return made[0]
+
+
+class Stream:
+    """Sends data packets (and position packets) at the sensor's rate from a thread, until `stop`."""
+
+    def __init__(
+        self,
+        sock: socket.socket,
+        data: tuple[str, int],
+        position: tuple[str, int] | None = None,
+        lose: int = 0,
+        **how: Any,
+    ) -> None:
+        self.sock, self.data, self.position, self.lose, self.how = sock, data, position, lose, how
+        self.sent = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        turn = [packet(number, **self.how) for number in range(1808)]
+        imu = struct.pack("<14x12H", *[tag << 12 for tag in range(4)] * 3).ljust(512, b"\0")
+        begin, done = time.monotonic(), 0
+        while not self._stop.wait(0.005):
+            due = int((time.monotonic() - begin) / 552.96e-6)
+            for number in range(done, due):
+                if not self.lose or number % self.lose:
+                    with suppress(OSError):  # the cable is out
+                        self.sock.sendto(turn[number % 1808], self.data)
+                        self.sent += 1
+                if self.position and number % 9 == 0:
+                    with suppress(OSError):
+                        self.sock.sendto(imu, self.position)
+            done = due
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
