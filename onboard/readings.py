@@ -84,7 +84,7 @@ class LidarReadings:
         # a stream that begins, ends, or had its packets read in bunches tells nothing of its rate in that second
         self._steady = self._steady + 1 if seen.expected_packets_s and age_s is not None and age_s < 0.5 else 0
         expected = seen.expected_packets_s if self._steady > 2 else 0.0
-        link = self._link()
+        link = True if age_s is not None and age_s < 0.5 else self._link()  # what packets come over is up
         return LidarStatus(
             state=lidarstate.classify(age_s, link, rejected_s, rate, expected),
             link=link,
