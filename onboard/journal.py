@@ -42,6 +42,7 @@ def fields(record: logging.LogRecord) -> dict[str, str | int]:
         "CODE_FILE": record.pathname,
         "CODE_LINE": record.lineno,
         "CODE_FUNC": record.funcName or "",
+        "SYSLOG_IDENTIFIER": "swathd",
         "SWATH_THREAD": record.threadName or "",
         **getattr(record, _FIELDS, {}),
     }
@@ -89,6 +90,7 @@ def start(level: int = logging.INFO) -> None:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     elif _send is not None and Path("/run/systemd/journal/socket").exists():
         handler = JournalHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
     else:
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(PriorityFormatter())
