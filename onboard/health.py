@@ -262,7 +262,7 @@ def _judge_lidar(lidar: LidarStatus) -> list[tuple[Level, str]]:
     if lidar.kernel_drops:
         found.append((Level.WARNING, f"lidar: {lidar.kernel_drops} packets lost in the receive buffer"))
     if lidar.queue_drops:
-        found.append((Level.WARNING, f"lidar: {lidar.queue_drops} packets lost because the disk was too slow"))
+        found.append((Level.WARNING, f"lidar: {lidar.queue_drops} packets lost because the disk was too slow or full"))
     return found
 
 
@@ -282,7 +282,7 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
         if hz < LOW_RATE * link.asked_hz.get(message, 0)
     ]
     if link.dropped_bytes:
-        found.append((Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow"))
+        found.append((Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow or full"))
     return found
 
 

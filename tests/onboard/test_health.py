@@ -43,7 +43,7 @@ def test_all_well_is_good() -> None:
         (LidarStatus(state=State.RATE_LOW, age_s=0.1, packets_s=900.0, expected_packets_s=1808.0), 1,
          "lidar: rate low, 900 packets/s, expected 1808; check cable, network load and receive buffer"),
         (LidarStatus(age_s=0.1, kernel_drops=5), 1, "lidar: 5 packets lost in the receive buffer"),
-        (LidarStatus(age_s=0.1, queue_drops=5), 1, "lidar: 5 packets lost because the disk was too slow"),
+        (LidarStatus(age_s=0.1, queue_drops=5), 1, "lidar: 5 packets lost because the disk was too slow or full"),
         (LidarStatus(age_s=0.1, rejected={"data packet of another sensor: VLP-16": 2}), 1,
          "lidar: 2 x data packet of another sensor: VLP-16"),
     ],
