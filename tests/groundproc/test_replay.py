@@ -13,9 +13,9 @@ import pytest
 
 from flightlog import records
 from flightlog.errors import LogError, SourceError, UsageError
-from flightlog.logfile import LogWriter
+from flightlog.logfile import LogReader, LogWriter
 from groundproc.cli import main
-from groundproc.replay import Destination, parse_mavlink, parse_speed, replay
+from groundproc.replay import Destination, datagrams, parse_mavlink, parse_speed, replay
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -103,19 +103,26 @@ def test_every_datagram_comes_once_in_order_and_unchanged(tmp_path: Path, listen
     assert listener.payloads(2) == [b"\xfe%d" % n for n in range(0, 200, 10)]
 
 
-@pytest.mark.parametrize(("speed", "seconds"), [(1.0, 1.0), (4.0, 0.25)])
+def test_datagrams_of_all_topics_are_put_in_the_order_of_their_times(tmp_path: Path) -> None:
+    with LogReader(write(tmp_path / "a.mcap")) as reader:
+        times = [event.time_ns for event in datagrams(reader.messages())]
+    assert times == sorted(times)
+    assert len(times) == 240
+
+
+@pytest.mark.parametrize(("interval_ms", "speed", "seconds"), [(5, 1.0, 1.0), (100, 20.0, 1.0)])
 def test_datagrams_are_sent_at_their_times_and_never_before(
-    tmp_path: Path, listener: Listener, speed: float, seconds: float
+    tmp_path: Path, listener: Listener, interval_ms: int, speed: float, seconds: float
 ) -> None:
     """A busy machine may be late, and says by how much; nothing is early by more than a slice of 2 ms."""
-    path = write(tmp_path / "a.mcap", packets=201)
+    path = write(tmp_path / "a.mcap", packets=201, interval_ns=interval_ms * 1_000_000)
     begin = time.monotonic()
     replayed = replay([path], listener.to(mavlink=False), speed)
     took = time.monotonic() - begin
     assert seconds - 0.002 <= took <= seconds + replayed.worst_late_s + 1.0
     listener.close()
     came = np.array([then for then, _ in listener.came[0]]) - begin
-    due = np.arange(201) * 0.005 / speed
+    due = np.arange(201) * interval_ms * 1e-3 / speed
     assert (came - due > -0.002).all()
     assert np.median(came - due) < replayed.worst_late_s + 0.5
     assert listener.came[2] == []  # nobody asked for the autopilot
@@ -131,9 +138,9 @@ def test_max_does_not_wait(tmp_path: Path, listener: Listener) -> None:
 def test_logs_are_played_in_the_order_of_their_times_without_the_pause_between(
     tmp_path: Path, listener: Listener
 ) -> None:
-    second = write(tmp_path / "1.mcap", packets=40, start_ns=START + 3600 * S)
-    first = write(tmp_path / "2.mcap", packets=60)
-    replayed = replay([second, first], listener.to(), speed=1.0)
+    second = write(tmp_path / "1.mcap", packets=40, interval_ns=S // 10, start_ns=START + 3600 * S)
+    first = write(tmp_path / "2.mcap", packets=60, interval_ns=S // 10)
+    replayed = replay([second, first], listener.to(), speed=20.0)
     assert replayed.pauses_cut == 1
     assert listener.payloads(0) == [packet(n) for n in [*range(60), *range(40)]]
 

@@ -64,6 +64,8 @@ class StandinAutopilot:
                 beat_s = time.monotonic() + 0.25
                 gimbal = dialect.MAVLink(None, srcSystem=7, srcComponent=154)
                 self._write(dialect.MAVLink_heartbeat_message(26, 8, ARMED, 0, 4, 3), gimbal)
+                for name in self.parameters:  # parameters of its own, by the same names
+                    self._write(dialect.MAVLink_param_value_message(name.encode(), 77, REAL32, 900, 899), gimbal)
                 self._write(dialect.MAVLink_heartbeat_message(2, 3, ARMED if self.armed else DISARMED, 0, 4, 3))
                 self._write(dialect.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0))
             if select.select([self._master], [], [], 0.01)[0]:

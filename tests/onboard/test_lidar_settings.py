@@ -81,8 +81,9 @@ def test_values_compare_however_the_firmware_writes_them() -> None:
 
 
 def test_apply_sets_what_differs_saves_and_verifies(
-    lidar: Callable[..., Any], capsys: pytest.CaptureFixture[str]
+    lidar: Callable[..., Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")  # of no concern on the lidar's cable
     sensor = lidar()
     sensor.settings |= {"rpm": 1200, "returns": "Dual", "laser": "Off"}
     sensor.settings["host"]["dport"] = 2370

@@ -209,6 +209,20 @@ def test_the_cap_holds_and_what_is_too_much_is_dropped_oldest_first(ground: Grou
     assert numbers[-1] > 5 * 181
 
 
+def test_the_cap_counts_what_the_wire_carries_around_each_datagram(ground: Ground) -> None:
+    """Ten bytes of MAVLink are 52 on an Ethernet: 64 kbit/s carry 154 of them a second, not 800."""
+    link = Relay(ground.config(rate_kbit_s=64))
+    begin = time.monotonic()
+    link.start()
+    for _ in range(10):
+        link.offer("/mavlink/ins", records.encode_raw(1, [(1, bytes(10))] * 200, "ins"))
+        time.sleep(0.1)
+    link.stop()
+    took = time.monotonic() - begin
+    assert 0 < link.counts.sent <= (8000 * (took + 0.05) + 1500) / 52 + 1
+    assert balanced(link.counts)
+
+
 def test_who_offers_never_waits_and_memory_is_bounded_while_the_thread_hangs() -> None:
     link = Relay(DownlinkConfig("127.0.0.1"))  # not started: as if it hung
     data = scan(181)
