@@ -6,10 +6,20 @@ config       what the operator may set
 fovmask      which packets and blocks lie outside the field of view (pure)
 timesync     log time from the host's clocks; kernel receive times through a step of the wall clock (pure)
 health       the status of everything, and the verdict on it (pure)
+clocksync    how the clocks of autopilot and lidar stand to log time (pure)
 datagrams    many datagrams of a socket in one system call, with the kernel's receive times and drop counts
-lidar        the HDL-32E's two ports -> batches
+packetfilter  a socket's filter in the kernel: one sender, one length
+lidar        the HDL-32E's two ports -> batches; who the lidar is
+batch        slots that fill up until a message is due
+lidarstate   the state of the lidar, by name
+sensorview   how the lidar is set, by its packets (pure)
 sources      the serial device or UDP port of a MAVLink link
 autopilot    MAVLink links -> raw chunks; asks for the streams
+autopilotclock  an autopilot's boot time and UTC: TIMESYNC, or its stamps
+voice        our frames on a link, in the autopilot's version
+announce     what the ground station is told (pure)
+readings     what the receivers count -> what the status says
+preflight    everything tried before a flight
 recorder     bounded backlog -> segments of the flight log, synced to the disk twice a second; watches the space left
 segment      one file of the flight log, until it is read-only and in the manifest
 logfolder    names, manifest, space
