@@ -1,0 +1,345 @@
+"""The service in a real, booted systemd: a container on a copy-on-write view of this very system."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+ROOT = Path(__file__).resolve().parents[2]
+WATCHDOG_S = 4
+"""Of the tests; the unit's own would take them long."""
+SERVICE = "/etc/systemd/system/swathd.service"
+
+missing = [name for name in ("systemd-nspawn", "nsenter", "unshare", "ip", "sshd") if shutil.which(name) is None]
+pytestmark = [
+    pytest.mark.root,
+    pytest.mark.skipif(os.geteuid() != 0, reason="booting a systemd needs root"),
+    pytest.mark.skipif(bool(missing), reason=f"not installed: {', '.join(missing)}"),
+]
+
+PROBE = """
+import ctypes, errno, json, mmap, os, socket, time
+def attempt(what):
+    try:
+        return what() or "done"
+    except OSError as error:
+        return errno.errorcode[error.errno]
+libc = ctypes.CDLL(None, use_errno=True)
+def call(name, *words):
+    return "done" if getattr(libc, name)(*words) == 0 else errno.errorcode[ctypes.get_errno()]
+def send(to):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.sendto(b"x", (to, 9))
+json.dump({
+    "write /etc": attempt(lambda: open("/etc/x", "w").close()),
+    "write /usr": attempt(lambda: open("/usr/x", "w").close()),
+    "write logs": attempt(lambda: open("/var/lib/swathd/x", "w").close() or os.remove("/var/lib/swathd/x")),
+    "home": attempt(lambda: str(os.listdir("/home"))),
+    "root": attempt(lambda: str(os.listdir("/root"))),
+    "packet socket": attempt(lambda: socket.socket(socket.AF_PACKET, socket.SOCK_RAW).close()),
+    "netlink": attempt(lambda: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW).close()),
+    "IPv6": attempt(lambda: socket.socket(socket.AF_INET6).close()),
+    "write and run": attempt(lambda: mmap.mmap(-1, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC).close()),
+    "set the clock": attempt(lambda: time.clock_settime(time.CLOCK_REALTIME, time.time())),
+    "mount": call("mount", b"none", b"/mnt", b"tmpfs", 0, None),
+    "new namespace": call("unshare", 0x10000000),
+    "kill init": attempt(lambda: os.kill(1, 0)),
+    "see init": attempt(lambda: os.stat("/proc/1").st_uid),
+    "send to ourselves": attempt(lambda: send("127.0.0.1")),
+    "send elsewhere": attempt(lambda: send("10.99.0.1")),
+}, open("/run/swathd/probe.json", "w"))
+"""
+
+BOOT = """
+set -eu
+mkdir -p /run/systemd/nspawn  # in this namespace only: it may not lie on a disk
+mount -t tmpfs tmpfs /run/systemd/nspawn
+mount -t tmpfs tmpfs {work}
+mkdir {work}/upper {work}/work {work}/root
+mount -t overlay overlay -o lowerdir=/,upperdir={work}/upper,workdir={work}/work {work}/root
+cd {work}/root
+rm -rf etc/machine-id etc/systemd/system/*.wants etc/systemd/system/swathd* etc/swathd var/lib/swathd var/log/journal
+mkdir -p opt/swath-source opt/swath-venv opt/python opt/swath/bin opt/swath/lib/{python}/site-packages etc/swathd
+mkdir -p etc/systemd/system/swathd.service.d
+cp {files}/swathd opt/swath/bin/swathd
+cp {files}/pyvenv.cfg opt/swath/
+cp {files}/tree.pth opt/swath/lib/{python}/site-packages/
+cp {files}/probe.py opt/swath/
+cp {files}/probe.conf etc/systemd/system/swathd.service.d/
+cp {files}/key.pub etc/swathd/authorized_keys
+ln -s {base}/bin/{python} opt/swath/bin/python3
+{executable} -m onboard.cli install --root {work}/root --program /opt/swath/bin/swathd --lidar-interface lidar0
+exec env SYSTEMD_NSPAWN_UNIFIED_HIERARCHY=1 systemd-nspawn -q -D {work}/root -b \
+  --register=no --keep-unit --private-network --machine=swath-test --link-journal=no \
+  --system-call-filter=bpf --capability=CAP_BPF \
+  --bind-ro={source}:/opt/swath-source --bind-ro={venv}:/opt/swath-venv {bind}
+"""
+
+
+class Guest:
+    """A booted system with the service installed in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        python = f"python{sys.version_info.major}.{sys.version_info.minor}"
+        outside = not Path(sys.base_prefix).is_relative_to("/usr")
+        base = "/opt/python" if outside else sys.base_prefix
+        packages = f"lib/{python}/site-packages"
+        texts = {
+            "swathd": "#!/opt/swath/bin/python3\nimport sys\nfrom onboard.cli import main\nsys.exit(main())\n",
+            "pyvenv.cfg": f"home = {base}/bin\ninclude-system-site-packages = false\n",
+            "tree.pth": f"/opt/swath-source\n/opt/swath-venv/{packages}\n",
+            "probe.py": PROBE,
+            "probe.conf": f"[Service]\nWatchdogSec={WATCHDOG_S}\nExecStartPre=-/opt/swath/bin/python3 /opt/swath/probe.py\n",
+        }
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        (folder / "swathd").chmod(0o755)
+        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / "key"], check=True)
+        (folder / "work").mkdir()
+        script = BOOT.format(
+            work=folder / "work", files=folder, python=python, base=base, source=ROOT, venv=sys.prefix,
+            executable=sys.executable, bind=f"--bind-ro={sys.base_prefix}:/opt/python" if outside else "",
+        )  # fmt: skip
+        self.console = folder / "console"
+        with self.console.open("wb") as console:
+            self.process = subprocess.Popen(
+                ["unshare", "-m", "bash", "-c", script], stdin=subprocess.DEVNULL, stdout=console, stderr=console,
+                cwd=ROOT, start_new_session=True,
+            )  # fmt: skip
+
+    def boot(self) -> None:
+        self.wait_for(lambda: self.leader is not None, 60)
+        self.wait_for(lambda: self.systemctl("is-system-running").strip() in ("running", "degraded"), 60)
+        # the lidar on a cable of its own, and a stranger on another
+        for words in (
+            "link add name lidar0 type veth peer name plug0", "link set plug0 up", "link set lidar0 up",
+            "addr add 192.168.1.201/32 dev lidar0",
+            "link add name other type veth peer name plug1", "link set plug1 up", "link set other up",
+            "addr add 10.99.0.1/24 dev other",
+        ):  # fmt: skip
+            self.enter("ip", *words.split(), net_only=True)
+
+    @property
+    def leader(self) -> int | None:
+        """The guest's first process, once it runs."""
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+            for child in children:
+                if Path(f"/proc/{child}/comm").read_text().strip() == "systemd":
+                    return int(child)
+        return None
+
+    def wait_for(self, true: Callable[[], Any], limit_s: float) -> Any:
+        deadline = time.monotonic() + limit_s
+        while not (found := true()):
+            assert self.process.poll() is None, self.console.read_text(errors="replace")[-3000:]
+            assert time.monotonic() < deadline, self.console.read_text(errors="replace")[-3000:] + self.journal_text()
+            time.sleep(0.1)
+        return found
+
+    def enter(self, *words: str | Path, check: bool = True, net_only: bool = False) -> str:
+        spaces = ["-n"] if net_only else ["-a", "-r", "-w"]
+        line = ["nsenter", "-t", str(self.leader), *spaces, *words]
+        return subprocess.run(line, capture_output=True, text=True, check=check, timeout=60).stdout
+
+    def systemctl(self, *words: str) -> str:
+        return self.enter("systemctl", *words, check=False)
+
+    def show(self, name: str) -> str:
+        return self.systemctl("show", "--value", f"--property={name}", "swathd.service").strip()
+
+    def journal(self, *words: str) -> list[dict[str, Any]]:
+        text = self.enter("journalctl", "-o", "json", "--no-pager", "-q", *words, check=False)
+        return [json.loads(line) for line in text.splitlines()]
+
+    def journal_text(self) -> str:
+        return self.enter("journalctl", "-n", "60", "--no-pager", check=False) if self.leader else ""
+
+    def path(self, inside: str) -> Path:
+        """A file of the guest, as seen from here."""
+        return Path(f"/proc/{self.leader}/root{inside}")
+
+    @property
+    def pid(self) -> int:
+        """The daemon's, in the guest; there is one."""
+        pid = int(self.show("MainPID"))
+        assert pid > 1, self.journal_text()
+        return pid
+
+    def status(self) -> dict[str, Any]:
+        tree: dict[str, Any] = json.loads(self.path("/run/swathd/status.json").read_text())
+        return tree
+
+    def send(self, source: str = "192.168.1.201", count: int = 200) -> None:
+        """Packets of a lidar in the guest's network."""
+        block = struct.pack("<HH", 0xEEFF, 0) + 32 * struct.pack("<HB", 2500, 40)
+        packet = 12 * block + struct.pack("<IBB", 1000, 0x37, 0x21)
+        code = (
+            "import socket, time\n"
+            f"s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.bind(({source!r}, 0))\n"
+            f"for i in range({count}): s.sendto(bytes.fromhex({packet.hex()!r}), ('192.168.1.201', 2368)); time.sleep(0.001)\n"
+        )
+        self.enter(sys.executable, "-c", code, net_only=True)
+
+    def stop(self) -> None:
+        if self.leader is not None:
+            os.kill(self.leader, signal.SIGRTMIN + 4)  # poweroff, as systemd(1) has it
+        try:
+            self.process.wait(30)
+        except subprocess.TimeoutExpired:
+            os.killg(self.process.pid, signal.SIGKILL)
+            self.process.wait(10)
+
+
+@pytest.fixture(scope="module")
+def guest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guest]:
+    guest = Guest(tmp_path_factory.mktemp("guest"))
+    try:
+        guest.boot()
+        yield guest
+    finally:
+        guest.stop()
+
+
+def test_it_starts_with_the_system_and_is_ready(guest: Guest) -> None:
+    guest.wait_for(lambda: guest.show("ActiveState") == "active", 30)
+    assert guest.show("NRestarts") == "0"
+    assert guest.show("UnitFileState") == "enabled"
+    assert guest.show("StatusText").startswith("00001-000.mcap: lidar ")
+    started = guest.journal("SWATH_EVENT=recording")
+    assert [(line["_SYSTEMD_UNIT"], line["PRIORITY"], line["SWATH_SEGMENT"]) for line in started] == [
+        ("swathd.service", "6", "00001-000.mcap")
+    ]
+
+
+def test_packets_are_recorded_and_anybody_may_ask_for_the_health(guest: Guest) -> None:
+    before = guest.status()["lidar"]["received"]
+    guest.send(count=200)
+    guest.wait_for(lambda: guest.status()["lidar"]["received"] >= before + 200, 10)
+    words = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "/usr/local/bin/swathd", "health", "--json"]
+    answer = json.loads(guest.enter(*words, check=False))
+    assert answer["status"]["pid"] == guest.pid
+    assert answer["armed"] is None
+
+
+def test_the_network_of_the_lidar_is_set_up(guest: Guest) -> None:
+    def addresses() -> str:
+        return guest.enter("ip", "-br", "-4", "addr", "show", "lidar0")
+
+    guest.wait_for(lambda: "192.168.1.100/24" in addresses() and "192.168.3.100/24" in addresses(), 20)
+    # a sender of old firmware, anywhere in 192.168: the way back goes through this port
+    assert "dev lidar0" in guest.enter("ip", "route", "get", "192.168.17.162")
+
+
+def test_the_sandbox_is_in_force(guest: Guest) -> None:
+    lines = guest.path(f"/proc/{guest.pid}/status").read_text().splitlines()
+    process = {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    assert {process[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
+    assert (process["NoNewPrivs"], process["Seccomp"]) == ("1", "2")
+    assert set(process["Uid"].split()) == {guest.enter("id", "-u", "swath").strip()}
+
+
+def test_a_hang_ends_in_a_restart_that_records_on(guest: Guest) -> None:
+    first, began = guest.pid, time.monotonic()
+    guest.enter("kill", "-STOP", str(first))
+    guest.wait_for(lambda: guest.show("NRestarts") == "1" and guest.show("ActiveState") == "active", WATCHDOG_S + 20)
+    took_s = time.monotonic() - began
+    assert guest.show("NRestarts") == "1"
+    # a machine with more to do than it can is no measure
+    assert took_s < WATCHDOG_S + (2 if os.getloadavg()[0] < (os.cpu_count() or 1) else 15)
+    assert guest.pid != first
+    texts = [str(line["MESSAGE"]) for line in guest.journal("-u", "swathd.service")]
+    assert any(text.startswith("swathd.service: Watchdog timeout") for text in texts)
+    # killed by the watchdog, it said where it was
+    assert "Fatal Python error: Aborted" in texts
+    guest.send(count=200)
+    guest.wait_for(lambda: guest.status()["lidar"]["received"] >= 200, 10)
+    assert guest.status()["recorder"]["segment"] == "00001-001.mcap"
+
+
+def test_what_the_sandbox_forbids_fails(guest: Guest) -> None:
+    """Tried under the unit's own sandbox, before the start that followed the hang: then the network was there."""
+    assert json.loads(guest.path("/run/swathd/probe.json").read_text()) == {
+        "write /etc": "EROFS",
+        "write /usr": "EROFS",
+        "write logs": "done",
+        "home": "EACCES",
+        "root": "EACCES",
+        "packet socket": "EAFNOSUPPORT",
+        "netlink": "EAFNOSUPPORT",
+        "IPv6": "EAFNOSUPPORT",
+        "write and run": "EPERM",
+        "set the clock": "EPERM",
+        "mount": "EPERM",
+        "new namespace": "EPERM",
+        "kill init": "EPERM",
+        "see init": "ENOENT",
+        "send to ourselves": "done",
+        "send elsewhere": "EPERM",
+    }
+
+
+def test_packets_from_beyond_the_lidars_networks_never_reach_the_daemon(guest: Guest) -> None:
+    guest.systemctl("restart", "swathd.service")
+    # the first sender of good packets is taken for the lidar, if it is heard
+    guest.send("10.99.0.1", 100)
+    guest.send("192.168.1.201", 100)
+    guest.wait_for(lambda: guest.status()["lidar"]["kept"] >= 100, 10)
+    texts = [str(line["MESSAGE"]) for line in guest.journal(f"_PID={guest.pid}")]
+    assert [text for text in texts if text.startswith("the lidar is at")] == ["the lidar is at 192.168.1.201"]
+
+
+def test_the_key_of_the_pull_leads_to_the_gate_only(guest: Guest) -> None:
+    def ssh(command: str) -> "subprocess.CompletedProcess[str]":
+        known = f"UserKnownHostsFile={guest.folder}/known"
+        options = ["-o", "StrictHostKeyChecking=no", "-o", known, "-o", "BatchMode=yes"]
+        line = ["nsenter", "-n", "-t", str(guest.leader), "ssh", "-i", str(guest.folder / "key"), *options]
+        return subprocess.run([*line, "swath@127.0.0.1", command], capture_output=True, text=True, timeout=60)
+
+    guest.systemctl("start", "ssh.service")
+    answer = ssh("health --json")
+    assert json.loads(answer.stdout)["status"]["pid"] == guest.pid, answer.stderr
+    assert ssh("id").returncode == 126
+    assert ssh("manifest").returncode == 0
+
+
+def test_stopping_closes_the_log(guest: Guest) -> None:
+    last = guest.status()["recorder"]["segment"]
+    guest.systemctl("stop", "swathd.service")
+    assert (guest.show("ActiveState"), guest.show("Result")) == ("inactive", "success")
+    with guest.path(f"/var/lib/swathd/{last}").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    topics = {
+        channel.topic: summary.statistics.channel_message_counts.get(number, 0)
+        for number, channel in summary.channels.items()
+    }
+    assert topics["/velodyne_packets"] > 0
+    begun = guest.journal("SWATH_EVENT=recording", "-u", "swathd.service")
+    assert [line["SWATH_SEGMENT"] for line in begun] == ["00001-000.mcap", "00001-001.mcap", last]
+    assert {line["SYSLOG_IDENTIFIER"] for line in begun} == {"swathd"}
+    manifest = guest.path("/var/lib/swathd/manifest.jsonl").read_text()
+    assert {"00001-000.mcap", "00001-001.mcap", last} <= {json.loads(line)["file"] for line in manifest.splitlines()}
+
+
+def test_uninstalled_and_installed_again_where_it_runs(guest: Guest) -> None:
+    guest.enter("/opt/swath/bin/swathd", "uninstall")
+    assert guest.show("LoadState") == "not-found"
+    assert not guest.path(SERVICE).exists()
+    assert guest.path("/var/lib/swathd/00001-001.mcap").exists()
+    said = guest.enter("/opt/swath/bin/swathd", "install")
+    assert "enabled and started swathd.service" in said
+    assert (guest.show("ActiveState"), guest.show("UnitFileState")) == ("active", "enabled")
