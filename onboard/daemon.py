@@ -75,6 +75,7 @@ class Daemon:
         self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
         self._stop = stop
         self._status_trouble = False
+        self._was_armed = False
         self._links: dict[str, Link] = {}
         self._relay: Relay | None = None
 
@@ -199,11 +200,20 @@ class Daemon:
             )
             self._write_status(status)
             self._announce(status)
+            self._note_landing(health.armed(status, status.time_ns, self._boot_id))
             if not is_ready:
                 notify.ready(health.summary(status))
                 is_ready = True
             self._stroke(status, now_ns)
             self._stop.wait(_STATUS_S)
+
+    def _note_landing(self, is_armed: bool | None) -> None:
+        """A flight ends with its disarming: its segment is closed then, so that it can be pulled."""
+        assert self._recorder is not None
+        if is_armed is False and self._was_armed:
+            self._recorder.rotate()
+        if is_armed is not None:
+            self._was_armed = is_armed
 
     def _clock_syncs(self, clock: HostClock) -> list[ClockSync]:
         """How the devices' clocks stand to log time, also for the log."""

@@ -282,7 +282,9 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
         if hz < LOW_RATE * link.asked_hz.get(message, 0)
     ]
     if link.dropped_bytes:
-        found.append((Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow or full"))
+        found.append(
+            (Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow or full")
+        )
     return found
 
 
@@ -299,6 +301,10 @@ def _judge_recorder(recorder: RecorderStatus) -> list[tuple[Level, str]]:
         return [(Level.CRITICAL, f"recorder: nothing reached the disk for {recorder.sync_age_s:.0f} s")]
     if recorder.lost_on_disk:
         return [(Level.WARNING, f"recorder: {recorder.lost_on_disk} messages lost on a full disk")]
+    if recorder.leftovers_left:
+        return [
+            (Level.WARNING, f"recorder: {recorder.leftovers_left} earlier logs cut off and not mended; see the journal")
+        ]
     return []
 
 

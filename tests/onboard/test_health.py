@@ -82,9 +82,10 @@ def test_a_recorder_that_does_not_reach_the_disk_is_critical() -> None:
         (RecorderStatus(space="low"), 2, "recorder: space is low, so the lidar is not recorded"),
         (RecorderStatus(space="full", sync_age_s=60.0), 2, "recorder: the disk is full and nothing is recorded"),
         (RecorderStatus(lost_on_disk=7), 1, "recorder: 7 messages lost on a full disk"),
+        (RecorderStatus(leftovers_left=2), 1, "recorder: 2 earlier logs cut off and not mended"),
     ],
 )
-def test_a_disk_without_space_is_told(recorder: RecorderStatus, level: int, finding: str) -> None:
+def test_trouble_with_the_disk_is_told(recorder: RecorderStatus, level: int, finding: str) -> None:
     found = judged(replace(GOOD, recorder=recorder))
     assert found[0] == level
     assert found[1][0].startswith(finding)
