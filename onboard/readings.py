@@ -19,6 +19,8 @@ from onboard.packetfilter import address_number
 from onboard.sensorview import SensorView
 
 _THERMAL: Final = Path("/sys/class/thermal")
+_RATE_SECONDS: Final = 3
+_PAUSE_S: Final = 0.5
 _ENDURANCE_S: Final = 10.0
 """Over less than this the log's growth is not told from its bursts."""
 
@@ -63,7 +65,8 @@ class LidarReadings:
     def __init__(self, port: LidarPort, interface: str | None) -> None:
         self._port, self._interface = port, interface
         self._sensor = ""
-        self._steady = 0
+        self._steady: deque[tuple[int, int]] = deque(maxlen=_RATE_SECONDS + 1)
+        """Time and count of good packets at each status of a stream that neither began nor ended since."""
 
     def _link(self) -> bool | None:
         """Whether its network link is up."""
@@ -73,6 +76,20 @@ class LidarReadings:
             self._interface = lidarstate.interface_towards(address_number(sensor))
         return lidarstate.carrier(self._interface)
 
+    def _is_steady(self, log_ns: int, age_s: float | None) -> bool:
+        """Whether the stream has gone on for long enough to tell its rate; batches make that of one second uneven by a tenth."""
+        if age_s is None or age_s > _PAUSE_S:
+            self._steady.clear()
+        else:
+            self._steady.append((log_ns, self._port.counts.good))
+        return len(self._steady) > _RATE_SECONDS
+
+    def _mean_rate(self) -> float:
+        if len(self._steady) < 2:
+            return 0.0
+        (then_ns, before), (now_ns, count) = self._steady[0], self._steady[-1]
+        return (count - before) * NS_PER_S / (now_ns - then_ns)
+
     def status(self, log_ns: int, per_second: PerSecond) -> LidarStatus:
         """What the status says of the lidar; to be asked once a second."""
         counts = self._port.counts
@@ -81,12 +98,10 @@ class LidarReadings:
         rejected = dict(counts.rejected)
         rejected_s = {reason: per_second(reason, count) for reason, count in rejected.items()}
         seen = self._port.view() or SensorView()
-        # a stream that begins, ends, or had its packets read in bunches tells nothing of its rate in that second
-        self._steady = self._steady + 1 if seen.expected_packets_s and age_s is not None and age_s < 0.5 else 0
-        expected = seen.expected_packets_s if self._steady > 2 else 0.0
+        expected = seen.expected_packets_s if self._is_steady(log_ns, age_s) else 0.0
         link = True if age_s is not None and age_s < 0.5 else self._link()  # what packets come over is up
         return LidarStatus(
-            state=lidarstate.classify(age_s, link, rejected_s, rate, expected),
+            state=lidarstate.classify(age_s, link, rejected_s, self._mean_rate(), expected),
             link=link,
             sensor=counts.sensor,
             age_s=age_s,

@@ -7,12 +7,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from lidar_stream import cable, from_address, inside, needs_namespaces, packet, run
+from lidar_stream import Stream, cable, from_address, inside, needs_namespaces, packet, run
 
 from flightlog import records
 from onboard import lidar, lidarstate
 from onboard.config import FovConfig, LidarConfig
 from onboard.lidar import LidarPort
+from onboard.readings import LidarReadings, Rates
 from onboard.timesync import LogTime, read_clocks
 
 SENSOR, STRANGER = "127.0.0.2", "127.0.0.3"
@@ -29,7 +30,8 @@ class Port:
         config = LidarConfig(
             address, *self.ports, poll_ms=20, receive_buffer_kb=2048, fov=FovConfig(0, 0), sensor=sensor
         )
-        self.port = LidarPort(config, LogTime.start(read_clocks()), self.put)
+        self.log_time = LogTime.start(read_clocks())
+        self.port = LidarPort(config, self.log_time, self.put)
         self.port.start()
 
     def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
@@ -207,3 +209,28 @@ def test_the_addresses_of_new_firmware_are_heard_and_broadcasts_of_others_refuse
         assert port.marks() == {1: 300}
         assert port.account("rejected_sender") == 299 * 5
         assert port.account("kernel_drops") == 0
+
+
+@pytest.mark.parametrize(("lose", "mode", "state"), [(4, 0x37, "rate low"), (0, 0x37, "good"), (0, 0x39, "rate low")])
+def test_a_rate_is_low_by_what_return_mode_and_field_of_view_promise(lose: int, mode: int, state: str) -> None:
+    port, rates = Port(), Rates()
+    readings = LidarReadings(port.port, None)
+    found = []
+    with from_address(SENSOR) as sensor:
+        # of a sensor in dual return mode that sends as one in single return mode does, half is missing
+        stream = Stream(sensor, ("127.0.0.1", port.ports[0]), lose=lose, mode=mode)
+        for _ in range(6):
+            time.sleep(1.0)
+            now = read_clocks()
+            rates.begin(now.monotonic_ns)
+            found.append(readings.status(port.log_time.at(now), rates.per_second).state)
+        stream.stop()
+    port.stop()
+    assert found[:2] == ["good", "good"]  # not known yet
+    assert found[-1] == state
+
+
+def test_the_interface_of_a_sensor_is_the_one_on_the_way_back_to_it() -> None:
+    assert lidarstate.interface_towards(0x7F000002) == "lo"
+    assert lidarstate.carrier("lo") is True
+    assert lidarstate.carrier("no-such-interface") is None
