@@ -33,7 +33,9 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source.mkdir()
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     for name in tracked.decode().split("\x00"):
-        if name.endswith((".py", ".toml", ".md", ".yaml", ".param")) and (ROOT / name).is_file():
+        if (name.endswith((".py", ".toml", ".md", ".yaml", ".param")) or name.startswith("systemd/")) and (
+            ROOT / name
+        ).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     pip = [folder / "venv/bin/python", "-m", "pip", "install", "--quiet", "--retries", "1"]
@@ -68,3 +70,8 @@ def test_the_daemon_prints_a_configuration_that_it_takes(bare: Path, tmp_path: P
     path.write_text(sample)
     check = "import sys; from flightlog.config import load; from onboard.config import SwathdConfig; load(sys.argv[1], SwathdConfig)"
     call(bare, "python", "-c", check, str(path))
+
+
+def test_the_wheel_has_the_files_of_the_service(bare: Path) -> None:
+    look = "from onboard import install; print(install.template('swathd.service'))"
+    assert "WatchdogSec" in call(bare, "python", "-c", look)
