@@ -158,7 +158,8 @@ class Link(Worker):
                 self._talk(source, now_ns)
             self.progress()
             self.pause(source.pause_s)
-        self._take(source.read())
+        if poll.poll(0):  # reading nothing from a serial device looks like its end
+            self._take(source.read())
 
     def _take(self, chunks: list[Chunk]) -> None:
         """Keep the chunks for the log, and have a look at the frames in them."""

@@ -1,8 +1,10 @@
 """The check before a flight, with real sockets, a real pty and a real disk."""
 
+import importlib.util
 import json
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lidar_stream import Stream, from_address
@@ -12,7 +14,14 @@ from onboard.config import FovConfig, LidarConfig, RecorderConfig
 from onboard.health import Level, LidarStatus
 from onboard.lidar_settings import LidarSettings
 from onboard.lidarstate import State
+from onboard.parameters import shipped
 from onboard.preflight import check_buffer, check_disk, judge_lidar, missing_deg
+
+_standin = importlib.util.spec_from_file_location("standin_autopilot", Path(__file__).with_name("standin_autopilot.py"))
+assert _standin is not None
+assert _standin.loader is not None
+standin: Any = importlib.util.module_from_spec(_standin)
+_standin.loader.exec_module(standin)
 
 
 def port() -> int:
@@ -126,3 +135,24 @@ def test_a_lidar_in_trouble_has_its_states_name_and_a_remedy(state: State) -> No
     assert item.level == Level.CRITICAL
     assert item.found == state
     assert len(item.remedy) > 15
+
+
+def test_an_autopilot_is_asked_for_its_rates_and_its_parameters(
+    aircraft: Aircraft, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wanted = shipped("ins", "3.1.3")
+    values = {name: [parameter.value, standin.REAL32] for name, parameter in wanted.items()}
+    (changed, *_) = values
+    values[changed] = [wanted[changed].value + 1, standin.REAL32]
+    autopilot = standin.StandinAutopilot(values)
+    aircraft.tree["ins"] = {"device": autopilot.device}
+    try:
+        code, items = aircraft.check(capsys)
+    finally:
+        autopilot.close()
+    assert code == 2  # there is no lidar
+    assert items["link ins"]["found"].startswith("autopilot 7/1, MAVLink 1")
+    assert items["link ins rates"]["level"] == "WARNING"  # it has no streams but a slow one
+    assert "SRx_" in items["link ins rates"]["remedy"]
+    assert items["parameters ins"]["found"].startswith(f"1 of {len(wanted)} differ: {changed}: ")
+    assert items["parameters ins"]["remedy"].startswith("swathd parameters apply --device ")
