@@ -130,6 +130,7 @@ class Salvager(threading.Thread):
             self._enter(new, found, "salvaged", path)
         else:
             aside = path.with_suffix(".damaged")
+            aside.unlink(missing_ok=True)  # the same file, of a salvage that was interrupted
             os.link(path, aside)
             self._enter(aside, found, "damaged", aside)
             self._enter(new, found, "salvaged", path)

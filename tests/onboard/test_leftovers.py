@@ -61,11 +61,14 @@ def test_a_torn_log_is_made_whole_read_only_and_entered_with_what_was_lost(tmp_p
     assert mend(tmp_path).counts.found == 0
 
 
-def test_a_damaged_original_is_kept_beside_what_could_be_read_of_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("interrupted_before", [False, True])
+def test_a_damaged_original_is_kept_beside_what_could_be_read_of_it(tmp_path: Path, interrupted_before: bool) -> None:
     path = left_open(tmp_path, 0)
     before = bytearray(path.read_bytes())
     before[len(before) // 2] ^= 1
     path.write_bytes(before)
+    if interrupted_before:
+        path.with_suffix(".damaged").hardlink_to(path)
     salvager = mend(tmp_path)
     assert salvager.counts.lossy == 1
     assert len(times(path)) == COUNT - 1
