@@ -12,6 +12,7 @@ from flightlog.errors import LogError, SwathError
 from flightlog.logfile import LogReader
 from flightlog.salvage import Salvage, examine, salvage
 from onboard import logfolder
+from onboard.journal import event
 from onboard.logfolder import READ_ONLY, Entry, sync_directory
 
 _log = logging.getLogger(__name__)
@@ -106,7 +107,7 @@ class Salvager(threading.Thread):
         try:
             LogReader(path).close()
         except LogError as error:
-            aside = path.with_suffix(".unreadable")
+            aside = path.with_name(f"{path.name}.unreadable")
             path.rename(aside)
             sync_directory(self._directory)
             line = {"file": path.name, "size": aside.stat().st_size, "how": "unreadable", "kept_as": aside.name}
@@ -123,20 +124,21 @@ class Salvager(threading.Thread):
                 "leftover %s stays as it is: no space to mend it; `swath recover` does it on the ground", path.name
             )
             return
-        new = path.with_suffix(_TEMPORARY)
+        new = path.with_name(path.name + _TEMPORARY)
         self._temporary = new
         found = salvage(path, new, compression=self._compression, progress=self._pace)
         if found.torn_tail_only:
             self._enter(new, found, "salvaged", path)
         else:
-            aside = path.with_suffix(".damaged")
+            aside = path.with_name(f"{path.name}.damaged")
             aside.unlink(missing_ok=True)  # the same file, of a salvage that was interrupted
             os.link(path, aside)
             self._enter(aside, found, "damaged", aside)
             self._enter(new, found, "salvaged", path)
             self.counts.lossy += 1
         self.counts.mended += 1
-        _log.warning("leftover %s mended: %s", path.name, "; ".join(found.sentences()))
+        lost = "; ".join(found.sentences())
+        _log.warning("leftover %s mended: %s", path.name, lost, extra=event("mended", segment=path.name))
 
     def _enter(self, file: Path, found: Salvage, how: str, name: Path) -> None:
         """Make a finished file read-only, give it its name, and enter it into the manifest."""

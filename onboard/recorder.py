@@ -19,6 +19,7 @@ from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from onboard import logfolder
 from onboard.config import RecorderConfig
+from onboard.journal import event
 from onboard.logfolder import Space
 from onboard.segment import Segment
 from onboard.worker import Worker
@@ -230,7 +231,7 @@ class Recorder(Worker):
             return
         try:
             segment.close({"refused": self._drops() - self._told_drops})
-            _log.info("closed %s", segment.path)
+            _log.info("closed %s", segment.path, extra=event("closed", segment=segment.path.name))
         except OSError as error:
             if error.errno not in _FULL:
                 raise
@@ -275,7 +276,7 @@ class Recorder(Worker):
 
     def _set_space(self, space: Space) -> None:
         if space is not self.counts.space:
-            _log.log(*_SPACE_NEWS[space])
+            _log.log(*_SPACE_NEWS[space], extra=event("space", space=space.value))
         self.counts.space = space
 
 

@@ -331,6 +331,8 @@ def test_stopping_closes_the_log(guest: Guest) -> None:
     begun = guest.journal("SWATH_EVENT=recording", "-u", "swathd.service")
     assert [line["SWATH_SEGMENT"] for line in begun] == ["00001-000.mcap", "00001-001.mcap", last]
     assert {line["SYSLOG_IDENTIFIER"] for line in begun} == {"swathd"}
+    closed = guest.journal("SWATH_EVENT=closed", f"SWATH_SEGMENT={last}")
+    assert [line["_SYSTEMD_UNIT"] for line in closed] == ["swathd.service"]
     manifest = guest.path("/var/lib/swathd/manifest.jsonl").read_text()
     assert {"00001-000.mcap", "00001-001.mcap", last} <= {json.loads(line)["file"] for line in manifest.splitlines()}
 
