@@ -69,6 +69,7 @@ LIDAR_ACCOUNT: Final = RecordType(
         "uint32 masked_blocks\n"
         "uint32 rejected_length\n"
         "uint32 rejected_content\n"
+        "# from others than the lidar; with what a filter in the kernel refused, whatever it was, which is in received too\n"
         "uint32 rejected_sender\n"
         "# lost in the socket's receive buffer, counted by the kernel\n"
         "uint32 kernel_drops\n"
