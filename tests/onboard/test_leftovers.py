@@ -68,11 +68,11 @@ def test_a_damaged_original_is_kept_beside_what_could_be_read_of_it(tmp_path: Pa
     before[len(before) // 2] ^= 1
     path.write_bytes(before)
     if interrupted_before:
-        path.with_suffix(".damaged").hardlink_to(path)
+        path.with_name("00001-000.mcap.damaged").hardlink_to(path)
     salvager = mend(tmp_path)
     assert salvager.counts.lossy == 1
     assert len(times(path)) == COUNT - 1
-    damaged = tmp_path / "00001-000.damaged"
+    damaged = tmp_path / "00001-000.mcap.damaged"
     assert damaged.read_bytes() == before
     lines = read_manifest(tmp_path)
     assert {name: line["how"] for name, line in lines.items()} == {path.name: "salvaged", damaged.name: "damaged"}
@@ -92,7 +92,7 @@ def test_what_is_no_log_is_set_aside_and_does_not_come_up_again(tmp_path: Path, 
     (tmp_path / "00001-000.mcap").write_bytes(content)
     torn = left_open(tmp_path, 1)
     salvager = mend(tmp_path)
-    assert (tmp_path / "00001-000.unreadable").read_bytes() == content
+    assert (tmp_path / "00001-000.mcap.unreadable").read_bytes() == content
     assert (salvager.counts.mended, salvager.counts.left) == (1, 1)
     assert len(times(torn)) == COUNT
     assert mend(tmp_path).counts.found == 0
@@ -119,10 +119,10 @@ def test_a_segment_that_is_being_written_is_no_leftover(tmp_path: Path) -> None:
 
 def test_what_an_interrupted_salvage_left_is_begun_anew(tmp_path: Path) -> None:
     path = left_open(tmp_path, 0)
-    (tmp_path / "00001-000.salvage").write_bytes(b"half of it")
+    (tmp_path / "00001-000.mcap.salvage").write_bytes(b"half of it")
     mend(tmp_path)
     assert len(times(path)) == COUNT
-    assert not (tmp_path / "00001-000.salvage").exists()
+    assert not (tmp_path / "00001-000.mcap.salvage").exists()
 
 
 def test_a_stop_leaves_the_original_for_the_next_start(tmp_path: Path) -> None:
