@@ -195,11 +195,11 @@ class Guest:
 
     def stop(self) -> None:
         if self.leader is not None:
-            os.kill(self.leader, signal.SIGRTMIN + 4)  # poweroff, as systemd(1) has it
+            os.kill(self.leader, signal.SIGRTMIN + 14)  # poweroff at once, as systemd(1) has it
         try:
             self.process.wait(30)
         except subprocess.TimeoutExpired:
-            os.killg(self.process.pid, signal.SIGKILL)
+            os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait(10)
 
 
