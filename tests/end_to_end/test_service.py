@@ -243,6 +243,13 @@ def test_the_network_of_the_lidar_is_set_up(guest: Guest) -> None:
     assert "dev lidar0" in guest.enter("ip", "route", "get", "192.168.17.162")
 
 
+@pytest.mark.skipif(shutil.which("udevadm") is None, reason="udev is not installed")
+def test_udev_understands_the_rules_and_leaves_other_ports_alone(guest: Guest) -> None:
+    done = guest.enter("sh", "-c", "udevadm test /sys/class/tty/tty0 2>&1", check=False)
+    assert "/etc/udev/rules.d/70-swathd.rules" in done
+    assert [line for line in done.splitlines() if "70-swathd.rules:" in line] == []
+
+
 def test_the_sandbox_is_in_force(guest: Guest) -> None:
     lines = guest.path(f"/proc/{guest.pid}/status").read_text().splitlines()
     process = {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
