@@ -6,6 +6,7 @@ boot is tied to the lidar by its own synchronisation. So the lidar, which is wha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,8 @@ Times = npt.NDArray[np.int64]
 LEAST_OVERLAP_NS: Final = 2 * NS_PER_S
 SEARCH_S: Final = 15.0
 """Shifts tried about what receive times say; a radio delays by up to 2 s, two computers' clocks by more."""
+DRIFT_SPAN_NS: Final = 600 * NS_PER_S
+"""From here on the drift that receive times show is better than none: it smears the gyros' correlation, and is right to some 10 ppm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +172,7 @@ def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: 
     if how == "host":
         return host
     try:
-        return _gyro_sync(run, boot, mat_ins_lidar, host.offset_ns)
+        return _gyro_sync(run, boot, mat_ins_lidar, host)
     except SyncError as error:
         if how == "gyro":
             raise
@@ -193,7 +196,7 @@ def _host_sync(run: LidarRun, boot_line: HostLine) -> Sync:
     )
 
 
-def _gyro_sync(run: LidarRun, boot: Boot, mat_ins_lidar: Array, expected_ns: int) -> Sync:
+def _gyro_sync(run: LidarRun, boot: Boot, mat_ins_lidar: Array, host: Sync) -> Sync:
     """Gyro correlation with each of the boot's gyro series; the one whose stamps the trajectory uses is preferred.
 
     Different messages are stamped at different points of the autopilot's loop: half of what they differ by goes into the sigma.
@@ -207,7 +210,7 @@ def _gyro_sync(run: LidarRun, boot: Boot, mat_ins_lidar: Array, expected_ns: int
     reasons: list[SyncError] = []
     for track in tracks:
         try:
-            results.append(_search(run.gyro, track, mat_ins_lidar, expected_ns))
+            results.append(_search(run.gyro, track, mat_ins_lidar, host))
         except SyncError as error:
             reasons.append(error)
     if not results:
@@ -221,12 +224,20 @@ def _gyro_sync(run: LidarRun, boot: Boot, mat_ins_lidar: Array, expected_ns: int
     return replace(chosen, sigma_offset_ns=float(np.hypot(chosen.sigma_offset_ns, 0.5 * apart)))
 
 
-def _search(gyro: GyroTrack, track: GyroTrack, mat_ins_lidar: Array, expected_ns: int) -> Sync:
+def _search(gyro: GyroTrack, track: GyroTrack, mat_ins_lidar: Array, host: Sync) -> Sync:
     """Near what receive times say, then anywhere: the two recordings may be from computers whose clocks differ."""
+    known = min(int(np.ptp(each.time_ns)) for each in (gyro, track)) >= DRIFT_SPAN_NS
+    match = partial(
+        sync.synchronise,
+        gyro,
+        track,
+        mat_ins_lidar=mat_ins_lidar,
+        expected_drift_ppm=host.drift_ppm if known else 0.0,
+    )
     try:
-        return sync.synchronise(gyro, track, mat_ins_lidar=mat_ins_lidar, expected_ns=expected_ns, search_s=SEARCH_S)
+        return match(expected_ns=host.offset_ns, search_s=SEARCH_S)
     except SyncError:
-        result = sync.synchronise(gyro, track, mat_ins_lidar=mat_ins_lidar)
-    apart_s = (result.offset_ns - expected_ns) / NS_PER_S
+        result = match()
+    apart_s = (result.offset_ns - host.offset_ns) / NS_PER_S
     note = f"the two recordings' receive times differ by {apart_s:+.1f} s from what the gyros say"
     return replace(result, note="; ".join(filter(None, (result.note, note))))

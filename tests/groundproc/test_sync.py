@@ -252,3 +252,17 @@ def test_on_the_313_recording_the_truth_is_met_within_its_lag(
         assert found.mount_angle_deg is not None
         assert found.mount_angle_deg < 1.0
         assert found.peak > 0.95
+
+
+def test_a_drift_that_receive_times_tell_is_taken_out_before_it_smears_the_correlation() -> None:
+    """1000 ppm over 10 min, 0.6 s between the ends, as 170 ppm over an hour. The stated sigma is at most 0.1 ms."""
+    motion, drift = rocking(3), 1000e-6
+    lidar, ins = lidar_gyro(motion, 600, 3, drift=drift), ins_gyro(motion, 600, 3, 25.0, 0.005)
+    with pytest.raises(SyncError, match="the best peak is"):
+        synchronise(lidar, ins, mat_ins_lidar=TILT)
+    # receive times are right to 10 ppm; the autopilot's clock is the slower one
+    found = synchronise(lidar, ins, mat_ins_lidar=TILT, expected_drift_ppm=(1 / (1 + drift) - 1) * 1e6 + 10.0)
+    assert found.peak > 0.9
+    assert found.sigma_offset_ns < 100_000
+    assert abs(error_ns(found, drift)) < 4.0 * found.sigma_offset_ns
+    assert abs(found.drift_ppm - (1 / (1 + drift) - 1) * 1e6) < 4.0 * found.sigma_drift_ppm
