@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Final
 
 GROUP: Final = "swath.commands"
+OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
 _INTERRUPTED: Final = 128 + signal.SIGINT
 _BROKEN_PIPE: Final = 128 + signal.SIGPIPE
 
@@ -45,6 +46,8 @@ def _outside(error: Exception) -> tuple[str, int]:
 
     if isinstance(error, SwathError):
         return str(error), error.exit_code
+    if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition(".")[0] not in OURS:
+        return f"{error.name} is not installed; pip install 'swath[ground,simulator]' brings what the commands need", 1
     if isinstance(error, OSError):
         reason = error.strerror or str(error)
         return (f"{error.filename}: {reason}" if error.filename else reason), 1

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from groundproc import cli
 from groundproc.cli import commands, main
 
 BIN = Path(sys.executable).parent
@@ -72,3 +73,20 @@ def test_ctrl_c_ends_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("groundproc.cli._dispatch", stop)
     assert main(["info"]) == 130
+
+
+def test_a_library_that_is_not_installed_is_one_sentence_and_a_mistake_of_ours_is_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def without(name: str) -> None:
+        def dispatch(_: list[str]) -> int:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+        monkeypatch.setattr(cli, "_dispatch", dispatch)
+
+    without("embreex.rtcore")
+    assert cli.main(["simulate"]) == 1
+    assert "embreex.rtcore is not installed" in capsys.readouterr().err
+    without("groundproc.nothing")
+    with pytest.raises(ModuleNotFoundError):
+        cli.main(["info"])
