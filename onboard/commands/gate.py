@@ -24,9 +24,11 @@ def run(options: argparse.Namespace) -> int:
 
     wish = gate.wish(os.environ.get("SSH_ORIGINAL_COMMAND", ""))
     if wish.verb == "health":
-        from onboard import cli
+        from onboard.commands import health
 
-        return cli.main(["health", "--config", str(options.config), *wish.words])
+        parser = argparse.ArgumentParser(prog="swathd health")
+        health.add_arguments(parser)
+        return health.run(parser.parse_args(["--config", str(options.config), *wish.words]))
     directory = Path(config.load(options.config).recorder.directory)
     if wish.verb == "rsync":
         _become_rsync(directory)
