@@ -209,6 +209,16 @@ def _fill(ends: Any, known: Any, firings: int, out: Any, covered: Any) -> None:
                     ]
 
 
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _axes(pose: Any, azimuth: float) -> Any:
+    """For x, y and z of the world: the sensor's forward and right turned to a block's azimuth, its up, its position."""
+    cosine, sine = np.cos(azimuth * decode.STEP_RAD), np.sin(azimuth * decode.STEP_RAD)
+    fx, rx = pose[0] * sine + pose[1] * cosine, pose[0] * cosine - pose[1] * sine
+    fy, ry = pose[3] * sine + pose[4] * cosine, pose[3] * cosine - pose[4] * sine
+    fz, rz = pose[6] * sine + pose[7] * cosine, pose[6] * cosine - pose[7] * sine
+    return fx, rx, pose[2], pose[9], fy, ry, pose[5], pose[10], fz, rz, pose[8], pose[11]
+
+
 @njit(cache=True, nogil=True, fastmath=True)
 def _place_single(
     raw: Any,
@@ -241,11 +251,7 @@ def _place_single(
                 counters[1] += LASERS
                 continue
             inside = decode.block_is_inside(azimuth, step, start, width)
-            # forward and right of the sensor, turned to the block's azimuth once; then its up and its position, all in the world
-            cosine, sine = np.cos(azimuth * decode.STEP_RAD), np.sin(azimuth * decode.STEP_RAD)
-            fx, rx, ux, tx = pose[0] * sine + pose[1] * cosine, pose[0] * cosine - pose[1] * sine, pose[2], pose[9]
-            fy, ry, uy, ty = pose[3] * sine + pose[4] * cosine, pose[3] * cosine - pose[4] * sine, pose[5], pose[10]
-            fz, rz, uz, tz = pose[6] * sine + pose[7] * cosine, pose[6] * cosine - pose[7] * sine, pose[8], pose[11]
+            fx, rx, ux, tx, fy, ry, uy, ty, fz, rz, uz, tz = _axes(pose, azimuth)
             firing_ns = time_ns[packet] + block * FIRING_NS
             at = block * _BLOCK_BYTES + 1
             for k in range(LASERS):
@@ -303,11 +309,7 @@ def _place_dual(
                 counters[1] += LASERS
                 continue
             inside = decode.block_is_inside(azimuth, step, start, width)
-            # forward and right of the sensor, turned to the block's azimuth once; then its up and its position, all in the world
-            cosine, sine = np.cos(azimuth * decode.STEP_RAD), np.sin(azimuth * decode.STEP_RAD)
-            fx, rx, ux, tx = pose[0] * sine + pose[1] * cosine, pose[0] * cosine - pose[1] * sine, pose[2], pose[9]
-            fy, ry, uy, ty = pose[3] * sine + pose[4] * cosine, pose[3] * cosine - pose[4] * sine, pose[5], pose[10]
-            fz, rz, uz, tz = pose[6] * sine + pose[7] * cosine, pose[6] * cosine - pose[7] * sine, pose[8], pose[11]
+            fx, rx, ux, tx, fy, ry, uy, ty, fz, rz, uz, tz = _axes(pose, azimuth)
             firing_ns = time_ns[packet] + firing * FIRING_NS
             for k in range(LASERS):
                 if not inside and (azimuth + step * decode.LASER_FRACTION * k - start) % decode.AZIMUTH_TURN > width:
