@@ -32,6 +32,10 @@ $(VENV)/.apt: apt-packages.txt
 	  if [ "$$(id -u)" = 0 ]; then sudo=(); else sudo=(sudo); fi; \
 	  "$${sudo[@]}" apt-get update -q; \
 	  "$${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -q -y --no-install-recommends "$${missing[@]}"; \
+	  if [[ " $${missing[*]} " == *" openssh-server "* ]] && [ -d /run/systemd/system ]; then \
+	    echo "openssh-server is here for the tests only: its service is switched off"; \
+	    "$${sudo[@]}" systemctl disable --now ssh.service ssh.socket 2>/dev/null || true; \
+	  fi; \
 	fi
 	@touch $@
 
