@@ -225,6 +225,12 @@ def payload_dtype(number: int) -> np.dtype[np.void]:
     return np.dtype(fields)
 
 
+def field_offset(name: str, field: str) -> int | None:
+    """Where a field of a message begins in its payload [bytes]; None where the message has no such field."""
+    fields = payload_dtype(message_id(name)).fields
+    return int(fields[field][1]) if fields is not None and field in fields else None
+
+
 def table(frames: Sequence[Frame], name: str) -> npt.NDArray[np.void]:
     """All messages of one kind as one array.
 
@@ -249,7 +255,7 @@ def table(frames: Sequence[Frame], name: str) -> npt.NDArray[np.void]:
     head = [("host_ns", "<i8"), ("system", "u1"), ("component", "u1")]
     # a message may itself have a field called system or component: its own values keep the plain name
     head = [field for field in head if field[0] not in dtype.names]
-    out = np.empty(len(mine), np.dtype([*head, *((n, dtype.fields[n][0]) for n in dtype.names)]))  # type: ignore[index]
+    out = np.empty(len(mine), np.dtype([*head, *((n, dtype[n]) for n in dtype.names)]))
     for field, values in (
         ("host_ns", [frame.time_ns for frame in mine]),
         ("system", [frame.system for frame in mine]),
@@ -268,7 +274,8 @@ def autopilots(frames: Iterable[Frame]) -> list[tuple[int, int]]:
     Ground stations, gimbals and companions say HEARTBEAT.autopilot = 8 and are left out.
     """
     found: dict[tuple[int, int], None] = {}
-    offset = payload_dtype(0).fields["autopilot"][1]  # type: ignore[index]
+    offset = field_offset("HEARTBEAT", "autopilot")
+    assert offset is not None
     for frame in frames:
         if frame.message_id == 0 and frame.known:
             payload = frame.payload.ljust(9, b"\x00")

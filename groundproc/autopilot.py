@@ -29,12 +29,12 @@ LOST_MS: Final = 10_000
 """A boot time that lags the receive time by more than this from one message to the next is a reboot; links delay by seconds."""
 
 _STAMP_OFFSETS: Final = {
-    mavlink.message_id(name): mavlink.payload_dtype(mavlink.message_id(name)).fields["time_boot_ms"][1]  # type: ignore[index]
+    mavlink.message_id(name): offset
     for name in (
         "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "SCALED_PRESSURE", "SYSTEM_TIME",
         "SCALED_IMU2", "RC_CHANNELS_RAW", "SERVO_OUTPUT_RAW",
     )
-    if "time_boot_ms" in (mavlink.payload_dtype(mavlink.message_id(name)).names or ())
+    if (offset := mavlink.field_offset(name, "time_boot_ms")) is not None
 }  # fmt: skip
 """Messages whose boot time marks the boots: id -> offset of time_boot_ms in the payload."""
 

@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # whoever read our output has gone; keep the interpreter from flushing into the broken pipe once more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
-    except Exception as error:
+    except Exception as error:  # `_outside` raises again what is a mistake of ours
         sentence, code = _outside(error)
         print(f"swath: {sentence}", file=sys.stderr)
     return code

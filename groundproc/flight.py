@@ -86,9 +86,9 @@ def _frames(
 def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarRun]:
     """Cut at the jumps of the lidar's clock against receive times."""
     device, receive = samples.device_time_ns, samples.receive_time_ns
-    if len(device) < 2:
+    has_positions = len(device) >= 2
+    if not has_positions:
         device, receive = _batch_times(readers)
-        samples = None  # type: ignore[assignment]
     if len(device) < 2:
         return []
     cuts = np.flatnonzero(np.abs(np.diff(device - receive)) > JUMP_NS) + 1
@@ -99,7 +99,7 @@ def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarR
             continue
         part = slice(a, b)
         line = timebase.host_line(device[part], receive[part])
-        gyro, fixes = (None, ()) if samples is None else (_gyro(samples, part), _fixes(samples, part))
+        gyro, fixes = (_gyro(samples, part), _fixes(samples, part)) if has_positions else (None, ())
         runs.append(LidarRun(int(receive[a]), int(receive[b - 1]), line, gyro, fixes))
     return runs
 

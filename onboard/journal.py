@@ -59,7 +59,7 @@ class JournalHandler(logging.Handler):
             _send(text, **fields(record))
         except OSError:
             sys.stderr.write(f"<{priority(record.levelno)}>{record.getMessage()}\n")
-        except Exception:
+        except Exception:  # as every logging handler: what is wrong with a record must not end who logs it
             self.handleError(record)
 
 

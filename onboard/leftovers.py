@@ -82,7 +82,7 @@ class Salvager(threading.Thread):
             except (OSError, SwathError) as error:
                 self.counts.left += 1
                 _log.error("leftover %s cannot be mended: %s", path.name, error)
-            except Exception:
+            except Exception:  # the top of a thread: one damaged log may not keep the others from being mended
                 self.counts.left += 1
                 _log.exception("leftover %s cannot be mended", path.name)
 

@@ -1,9 +1,10 @@
 """Parameters over MAVLink: read, set, and read back. A frame may be lost either way; nothing counts that was not confirmed."""
 
+import functools
 import math
 import select
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -153,10 +154,14 @@ class ParameterLink:
                 part = missing[start : start + _BURST]
                 for index in part:
                     self._send(self._mavlink.param_request_read_encode(system, component, b"", index))
-                self._until(lambda part=part: not set(part) & set(self._missing()), _WAIT_S)  # type: ignore[misc]
+                self._until(functools.partial(self._have, part), _WAIT_S)
         if not self.values or (missing := self._missing()):
             raise SourceError(f"{self._device}: {len(missing) or 'all'} parameters did not come in {_TRIES} tries")
         return {name: value.value for name, value in sorted(self.values.items())}
+
+    def _have(self, part: Sequence[int]) -> bool:
+        """Whether none of these parameters is missing."""
+        return not set(part) & set(self._missing())
 
     def _missing(self) -> list[int]:
         """Numbers of the parameters that have not come; [0] if none has."""

@@ -61,6 +61,6 @@ class Worker(threading.Thread, ABC):
         except OSError as error:  # a disk or a device, not a mistake of ours
             self.failure = f"{self.name}: {error.strerror or error}"
             _log.error("%s", self.failure, extra=event("failure", worker=self.name))
-        except Exception as error:
+        except Exception as error:  # the top of a thread: the failure is kept, and the watchdog no longer stroked
             self.failure = f"{self.name}: {type(error).__name__}: {error}"
             _log.exception("%s died", self.name, extra=event("failure", worker=self.name))
