@@ -11,7 +11,6 @@ import numpy.typing as npt
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from flightlog.logfile import LogReader
-from flightlog.mount import Mount
 from groundproc import decode, geodesy, georeference, load, sensor_model
 from groundproc.decode import Gate
 from groundproc.files import written_aside
@@ -20,7 +19,7 @@ from groundproc.products import las
 from groundproc.products.pictures import CloudSample
 from groundproc.survey import Survey
 from groundproc.timeline import Leg
-from groundproc.trajectory.trajectory import Trajectory
+from groundproc.trajectory.method import Estimate
 
 CHUNK_PACKETS: Final = 1808
 """Packets placed at a time, a second's worth: bounds the memory, and is long enough for both cores to compress."""
@@ -44,15 +43,14 @@ class Tally:
 def write_cloud(
     readers: Sequence[LogReader],
     timeline: Sequence[Leg],
-    trajectory: Trajectory,
-    mount: Mount,
+    made: Estimate,
     survey: Survey,
     projection: geodesy.Projection,
     folder: Path,
     progress: Callable[[int], None],
 ) -> tuple[Tally, CloudSample]:
     """Place every packet and write cloud.laz."""
-    tally, sample = Tally(), CloudSample()
+    tally, sample, trajectory = Tally(), CloudSample(), made.trajectory
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
     start = projection.exact(trajectory.position_m[:1])[0]
     offset_m = [float(np.floor(start[0] / 100) * 100), float(np.floor(start[1] / 100) * 100), 0.0]
@@ -61,7 +59,7 @@ def write_cloud(
         las.CloudWriter(aside, [las.LASER, las.RANGE], crs=cloud_crs(projection, survey), offset_m=offset_m) as cloud,
     ):
         for packets, utc_ns in chunks(readers, timeline, tally, progress):
-            points = georeference.georeference(packets, utc_ns, trajectory, mount, gate)
+            points = georeference.georeference(packets, utc_ns, trajectory, made.mount, gate, made.lasers)
             tally.dropped = tally.dropped + points.dropped
             if len(points):
                 project(points, projection)

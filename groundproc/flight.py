@@ -99,8 +99,8 @@ def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarR
             continue
         part = slice(a, b)
         line = timebase.host_line(device[part], receive[part])
-        gyro, fixes = (_gyro(samples, part), _fixes(samples, part)) if has_positions else (None, ())
-        runs.append(LidarRun(int(receive[a]), int(receive[b - 1]), line, gyro, fixes))
+        (gyro, force), fixes = (_imu(samples, part), _fixes(samples, part)) if has_positions else ((None, None), ())
+        runs.append(LidarRun(int(receive[a]), int(receive[b - 1]), line, gyro, fixes, force))
     return runs
 
 
@@ -113,13 +113,14 @@ def _batch_times(readers: Sequence[LogReader]) -> tuple[npt.NDArray[np.int64], n
     return table[:, 0], table[:, 1]
 
 
-def _gyro(samples: PositionSamples, part: slice) -> GyroTrack | None:
+def _imu(samples: PositionSamples, part: slice) -> tuple[GyroTrack, npt.NDArray[np.float64]] | tuple[None, None]:
+    """Rates and specific force of the samples that are later than all before them."""
     time_ns = samples.device_time_ns[part]
     good = samples.has_imu[part].copy()
     good[1:] &= time_ns[1:] > np.maximum.accumulate(time_ns)[:-1]
     if good.sum() < 2 or np.ptp(samples.gyro_rad_s[part][good], axis=0).max() == 0.0:
-        return None
-    return GyroTrack("the lidar", time_ns[good], samples.gyro_rad_s[part][good])
+        return None, None
+    return GyroTrack("the lidar", time_ns[good], samples.gyro_rad_s[part][good]), samples.accel_m_s2[part][good]
 
 
 def _fixes(samples: PositionSamples, part: slice) -> tuple[tuple[int, nmea.Rmc], ...]:

@@ -11,36 +11,34 @@ from flightlog.clock import utc_text
 from flightlog.constants import HOUR_NS
 from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
-from flightlog.mount import Mount
 from groundproc import geodesy
 from groundproc.cloud import Tally
 from groundproc.flight import Flight
 from groundproc.survey import Survey
 from groundproc.timeline import Leg
 from groundproc.trajectory import ins
-from groundproc.trajectory.trajectory import Trajectory
+from groundproc.trajectory.method import Estimate
 
 
 def describe(
     readers: Sequence[LogReader],
     survey: Survey,
-    mount: Mount,
+    made: Estimate,
     mount_source: str,
     flight: Flight,
     timeline: Sequence[Leg],
-    trajectory: Trajectory,
     projection: geodesy.Projection,
     tally: Tally,
 ) -> dict[str, Any]:
     """What went in, what was dropped and why, and how well the clocks fit."""
-    frame = projection.frame
+    frame, trajectory = projection.frame, made.trajectory
     main = max(timeline, key=lambda leg: leg.sync.samples)
     seconds = np.diff(trajectory.time_ns) * 1e-9
     return {
         "software": {"swath": __version__, "log_format": FORMAT_VERSION},
         "inputs": [describe_log(reader) for reader in readers],
         "config": config.to_mapping(survey),
-        "mount": config.to_mapping(mount) | {"source": mount_source},
+        "mount": config.to_mapping(made.mount) | {"source": mount_source},
         "local_frame": {
             "latitude_deg": frame.latitude_deg,
             "longitude_deg": frame.longitude_deg,
@@ -66,8 +64,10 @@ def describe(
             "covered_s": float(seconds[trajectory.covered[:-1]].sum()),
             "gaps_s": float(seconds[~trajectory.covered[:-1]].sum()),
             "median_sigma_m": np.median(trajectory.sigma_position_m, axis=0).tolist(),
-            "sigma_source": ins.SIGMA_SOURCE,
+            "sigma_source": made.sigma_source,
+            "warning": made.warning,
         },
+        **({survey.method: made.report} if made.report else {}),
         "lidar": {
             "packets": tally.packets,
             "packets_outside_every_leg": tally.packets_without_leg,

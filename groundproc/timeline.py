@@ -44,6 +44,8 @@ class LidarRun:
         None where the lidar sent no position packets, or no readings in them.
     fixes : tuple of (int, Rmc)
         Lidar time [ns] at which each GPS sentence first appeared.
+    force_m_s2 : ndarray, shape (n, 3), or None
+        Specific force in the sensor frame at the gyro's samples.
     """
 
     first_receive_ns: int
@@ -51,6 +53,7 @@ class LidarRun:
     line: HostLine
     gyro: GyroTrack | None
     fixes: tuple[tuple[int, Rmc], ...]
+    force_m_s2: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,50 @@
+"""The methods by their names on the command line."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from flightlog.errors import LogError
+from groundproc.trajectory import ins
+from groundproc.trajectory.method import Estimate, Given, Progress
+from groundproc.trajectory.trajectory import Trajectory, joined
+
+
+def estimate(given: Given, progress: Progress) -> Estimate:
+    """Make the trajectory with the method that the survey chose."""
+    return METHODS[given.survey.method](given, progress)
+
+
+def ins_estimate(given: Given, progress: Progress) -> Estimate:
+    """The autopilot's own solution, interpolated; a boot that never had a fix leaves a gap.
+
+    Raises
+    ------
+    LogError
+        No boot gives a trajectory.
+    """
+    del progress
+    placed, grid_ms = given.placed, given.survey.pose_grid_ms
+    grid_ns = None if grid_ms is None else round(grid_ms * 1e6)
+    parts: list[Trajectory] = []
+    reasons: list[LogError] = []
+    for number, (leg, fix) in enumerate(zip(placed, given.fixes, strict=True)):
+        try:
+            part = ins.ins_trajectory(leg.boot, fix, given.frame, leg.utc_from_boot, given.mount, grid_ns)
+        except LogError as error:
+            reasons.append(error)
+            continue
+        # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
+        if number and placed[number - 1].boot is leg.boot and parts:
+            part = part.after(int(parts[-1].time_ns[-1]))
+        if number + 1 < len(placed) and placed[number + 1].boot is leg.boot:
+            part = part.before(int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]))
+        if len(part) > 1:
+            parts.append(part)
+    if reasons and not parts:
+        raise reasons[0]
+    return Estimate(joined(parts), given.mount, ins.SIGMA_SOURCE)
+
+
+METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {"ins": ins_estimate}
