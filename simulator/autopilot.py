@@ -17,7 +17,7 @@ from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US, STANDARD_GRAVITY
 from simulator.chance import generator
 from simulator.clocks import Clock, Clocks
 from simulator.config import LinkOptions, Options
-from simulator.faults import Reboot, garbage_before
+from simulator.faults import Outage, Reboot, garbage_before
 from simulator.geodesy import Origin, geodetic
 from simulator.ins import Belief, Ins
 
@@ -52,6 +52,7 @@ def achieved_hz(asked_hz: float, firmware: str) -> float:
 class _Moment:
     """One instant at which a message is built."""
 
+    time_s: float
     boot_ns: int
     utc_ns: int
     epoch_ns: int
@@ -70,7 +71,8 @@ class Autopilot:
     def __init__(self, ins: Ins, clocks: Clocks, options: Options, origin: Origin, seed: int) -> None:
         self._ins, self._clocks, self._origin, self._seed = ins, clocks, origin, seed
         self._options: LinkOptions = options.link
-        self._reboot = Reboot.of(options.faults)
+        self._reboot, self._outage = Reboot.of(options.faults), Outage.of(options.faults)
+        self._last_fix = self._fix_before_outage()
         self._garbage_hz = options.faults.garbage_per_s
         self._mavlink = ardupilotmega.MAVLink(None, srcSystem=SYSTEM, srcComponent=1)
         self._last_received_s = -np.inf
@@ -117,6 +119,14 @@ class Autopilot:
         """The boot clock in force at a true time: a reboot starts another."""
         return self._reboot.clock(time_s, self._clocks.boot)
 
+    def _fix_before_outage(self) -> "_Moment | None":
+        """What the receiver goes on stating while it has no fix: its last one."""
+        if self._outage.start_s <= 0:
+            return None
+        time_s = max(self._outage.start_s - 1.0 / _GPS_HZ, 0.0)
+        belief = self._ins.belief(np.array([time_s]), generator(self._seed, "last fix"))
+        return self._moment(time_s, 0, belief, geodetic(belief.position_m, self._origin))
+
     def _schedule(self, start_s: float, end_s: float) -> tuple[Array, list[str]]:
         """Build times in [start, end) in order, and what is built."""
         times, names = [], []
@@ -146,6 +156,7 @@ class Autopilot:
         clock = self.boot_clock(time_s)
         epoch_s = np.floor((time_s - 0.12) * _GPS_HZ) / _GPS_HZ
         return _Moment(
+            time_s=time_s,
             boot_ns=int(clock.shows_ns(time_s)),
             utc_ns=int(self._clocks.utc.shows_ns(time_s)),
             epoch_ns=int(self._clocks.utc.shows_ns(epoch_s)),
@@ -201,21 +212,24 @@ class Autopilot:
         )
 
     def _gps_raw_int(self, m: _Moment) -> Any:
+        fix, dilution, satellites = 3, 120, 11
+        if self._last_fix is not None and self._outage.holds(m.time_s):
+            m, fix, dilution, satellites = self._last_fix, 1, 9999, 3
         latitude, longitude, height_mm = self._place(m)
         east, north, _ = m.belief.velocity_m_s[m.row]
         course = round(np.degrees(np.arctan2(east, north)) * 100.0) % 36000
         since_epoch_ns = m.utc_ns - m.epoch_ns
         return ardupilotmega.MAVLink_gps_raw_int_message(
             (m.boot_ns - since_epoch_ns) // NS_PER_US,
-            3,
+            fix,
             latitude,
             longitude,
             height_mm,
-            120,
+            dilution,
             65535,
             round(np.hypot(east, north) * 100.0),
             course,
-            11,
+            satellites,
         )
 
     def _sys_status(self, _: _Moment) -> Any:

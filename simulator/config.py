@@ -5,7 +5,7 @@ The defaults are those of wire.md's measurements on real units and of low-cost a
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from flightlog.config import option
 
@@ -19,6 +19,9 @@ class LidarOptions:
     range_noise_m: float = option(0.015, "noise of a range, one sigma [m]", minimum=0, maximum=1)
     laser_bias_m: float = option(
         0.0, "constant range error of each laser, one sigma over lasers [m]", minimum=0, maximum=1
+    )
+    elevation_error_deg: float = option(
+        0.0, "constant error of each laser's elevation, one sigma over lasers [deg]", minimum=0, maximum=5
     )
     intensity_noise: float = option(
         0.15, "fluctuation of a return's strength, one sigma, relative", minimum=0, maximum=1
@@ -44,6 +47,15 @@ class GyroOptions:
     rotor_line_deg_s: float = option(0.3, "amplitude at the rotor's frequency [deg/s]", minimum=0, maximum=50)
     accel_noise_g: float = option(0.015, "white noise of a sample, one sigma [g]", minimum=0, maximum=2)
     accel_rotor_line_g: float = option(0.04, "amplitude at the rotor's frequency [g]", minimum=0, maximum=2)
+    scale: float = option(
+        0.0, "scale factor error of each gyro, one sigma over seeds, relative", minimum=0, maximum=0.5
+    )
+    scale_fixed: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), "and on top of it for gyro 1, 2, 3, relative", minimum=-0.5, maximum=0.5
+    )
+    misalignment_deg: float = option(
+        0.0, "tilt of each gyro's axis towards each other one, one sigma over seeds [deg]", minimum=0, maximum=10
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +116,38 @@ class InsOptions:
     gyro_bias_deg_s: float = option(
         0.3, "constant error of each rate, one sigma over seeds [deg/s]", minimum=0, maximum=50
     )
+    gyro_scale: float = option(
+        0.0, "scale factor error of each gyro, one sigma over seeds, relative", minimum=0, maximum=0.5
+    )
+    gyro_scale_fixed: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), "and on top of it: right, forward, up, relative", minimum=-0.5, maximum=0.5
+    )
+    gyro_misalignment_deg: float = option(
+        0.0, "tilt of each gyro's axis towards each other one, one sigma over seeds [deg]", minimum=0, maximum=10
+    )
     gyro_filter_hz: float = option(20.0, "low-pass of the gyros [Hz]; takes vibration away", minimum=0.1, maximum=1000)
     gyro_delay_s: float = option(
         0.0, "delay of that filter: states are this much older than stamped [s]", minimum=0, maximum=1
     )
+    position_delay_s: float = option(
+        0.0, "positions and velocities are older than stamped by this beyond that delay [s]", minimum=0, maximum=5
+    )
     accel_noise_m_s2: float = option(0.3, "white noise of a specific force, one sigma [m/s^2]", minimum=0, maximum=50)
+    accel_bias_m_s2: float = option(
+        0.0, "constant error of each specific force, one sigma over seeds [m/s^2]", minimum=0, maximum=10
+    )
+    accel_scale: float = option(
+        0.0, "scale factor error of each accelerometer, one sigma over seeds, relative", minimum=0, maximum=0.5
+    )
+    accel_scale_fixed: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), "and on top of it: right, forward, up, relative", minimum=-0.5, maximum=0.5
+    )
+    accel_misalignment_deg: float = option(
+        0.0,
+        "tilt of each accelerometer's axis towards each other one, one sigma over seeds [deg]",
+        minimum=0,
+        maximum=10,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +189,25 @@ class MountOptions:
     lever_m: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), "true minus nominal lever arm: right, forward, up [m]", minimum=-1, maximum=1
     )
+    boresight_spread_deg: float = option(
+        0.0, "yaw, pitch and roll are off by up to this on top, uniform over seeds [deg]", minimum=0, maximum=20
+    )
+    lever_spread_m: float = option(
+        0.0, "right, forward and up are off by up to this on top, uniform over seeds [m]", minimum=0, maximum=1
+    )
+    gps_position_m: tuple[float, float, float] | None = option(
+        None,
+        "antenna of the GPS as the log's mount has it: right, forward, up [m]; positions are those of the antenna; "
+        "null: the log's mount names none",
+        minimum=-5,
+        maximum=5,
+    )
+    gps_error_m: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0),
+        "true minus nominal place of the antenna, from the INS where none is named [m]",
+        minimum=-5,
+        maximum=5,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +216,17 @@ class FaultOptions:
 
     reboot_at_s: float = option(0.0, "the INS reboots at [s]", minimum=0, maximum=1e6)
     reboot_silence_s: float = option(6.0, "and is silent for [s]", minimum=0, maximum=1e4)
-    lidar_gap_at_s: float = option(0.0, "lidar packets get lost from [s]", minimum=0, maximum=1e6)
+    lidar_gap_at_s: float = option(
+        0.0, "the lidar's cable is out, neither data nor position packets come, from [s]", minimum=0, maximum=1e6
+    )
     lidar_gap_s: float = option(0.5, "for [s]", minimum=0, maximum=1e4)
+    gnss_gap_at_s: float = option(
+        0.0,
+        "the GPS has no fix from [s]: GPS_RAW_INT says so, GLOBAL_POSITION_INT goes on by dead reckoning",
+        minimum=0,
+        maximum=1e6,
+    )
+    gnss_gap_s: float = option(30.0, "for [s]", minimum=0, maximum=1e4)
     garbage_per_s: float = option(0.0, "bursts of line noise on the MAVLink bytes [1/s]", minimum=0, maximum=100)
 
 
@@ -198,14 +265,22 @@ def perfect(options: Options, part: str = "all") -> Options:
         options = dataclasses.replace(
             options,
             lidar=dataclasses.replace(
-                options.lidar, range_noise_m=0.0, laser_bias_m=0.0, intensity_noise=0.0, encoder_noise_deg=0.0
+                options.lidar,
+                range_noise_m=0.0,
+                laser_bias_m=0.0,
+                elevation_error_deg=0.0,
+                intensity_noise=0.0,
+                encoder_noise_deg=0.0,
             ),
             gyros=GyroOptions((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0),
             clocks=dataclasses.replace(options.clocks, arrival_jitter_us=0.0),
         )
     if part in ("ins", "all"):
         kept = ("gnss_tau_s", "gyro_filter_hz")
-        zeros = {field.name: 0.0 for field in dataclasses.fields(InsOptions) if field.name not in kept}
+        fields = [field for field in dataclasses.fields(InsOptions) if field.name not in kept]
+        zeros: dict[str, Any] = {
+            field.name: (0.0, 0.0, 0.0) if isinstance(field.default, tuple) else 0.0 for field in fields
+        }
         options = dataclasses.replace(
             options,
             flight=dataclasses.replace(options.flight, vibration_deg=0.0),

@@ -44,6 +44,23 @@ class Reboot:
         return Clock(start_ns + (first.start_ns - start_ns) % NS_PER_MS, first.drift_ppm)
 
 
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """A stretch of true time without GPS fix; never if start is 0."""
+
+    start_s: float = 0.0
+    end_s: float = 0.0
+
+    @classmethod
+    def of(cls, options: FaultOptions) -> "Outage":
+        """The GPS outage of a configuration."""
+        return cls(options.gnss_gap_at_s, options.gnss_gap_at_s + options.gnss_gap_s)
+
+    def holds(self, time_s: float) -> bool:
+        """Whether there is no fix at a true time."""
+        return self.start_s > 0 and self.start_s <= time_s < self.end_s
+
+
 def arriving(sent_s: npt.NDArray[np.float64], options: FaultOptions) -> npt.NDArray[np.bool_]:
     """Which lidar packets are not lost, shape (n,)."""
     if options.lidar_gap_at_s <= 0:

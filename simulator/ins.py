@@ -9,10 +9,12 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from flightlog.frames import ins_from_frd
+from flightlog.frames import ins_from_frd, mat_local_ins
 from simulator.chance import generator
 from simulator.config import InsOptions
+from simulator.faults import Outage
 from simulator.flight import Flight
+from simulator.imu import Triad
 
 Array = npt.NDArray[np.float64]
 
@@ -20,6 +22,8 @@ _STEP_S: Final = 0.1
 _TILT_TAU_S: Final = 8.0
 _POSITION_SMOOTH_S: Final = 1.5
 _MARGIN_S: Final = 10.0
+_RECOVERY_S: Final = 2.5
+"""Time constant with which the position goes back to the fixes after an outage (AP_InertialNav of ArduCopter 3.1)."""
 
 
 def gauss_markov(rng: np.random.Generator, count: int, sigma: float, tau_s: float, step_s: float) -> Array:
@@ -39,6 +43,7 @@ class Belief:
     heading_rad, pitch_rad, roll_rad : shape (n,); the heading is continuous
     rates_frd_rad_s, force_frd_m_s2 : shape (n, 3), forward right down
     position_m, velocity_m_s : shape (n, 3), local frame
+        Of the GPS antenna where the position is not referred to the IMU.
     """
 
     heading_rad: Array
@@ -51,10 +56,29 @@ class Belief:
 
 
 class Ins:
-    """The INS of one simulation."""
+    """The INS of one simulation.
 
-    def __init__(self, flight: Flight, options: InsOptions, seed: int) -> None:
+    Parameters
+    ----------
+    flight : Flight
+    options : InsOptions
+    seed : int
+    antenna_m : tuple of float, optional
+        True place of the GPS antenna in the ins frame, to which positions belong [m]; none: to the IMU.
+    outage : Outage, optional
+        When there is no GPS.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        options: InsOptions,
+        seed: int,
+        antenna_m: tuple[float, float, float] | None = None,
+        outage: Outage | None = None,
+    ) -> None:
         self._flight, self._options = flight, options
+        self._antenna_m = None if antenna_m is None else np.array(antenna_m)
         rng = generator(seed, "ins")
         time_s = np.arange(-_MARGIN_S, flight.duration_s + _MARGIN_S, _STEP_S)
         count, o = len(time_s), options
@@ -65,10 +89,59 @@ class Ins:
         walk = np.cumsum(rng.standard_normal(count)) * o.baro_walk_m * np.sqrt(_STEP_S / 60.0)
         up = o.height_bias_m * rng.standard_normal() + walk - walk[round(_MARGIN_S / _STEP_S)]
         position = gaussian_filter1d(np.stack([*across, up], axis=1), _POSITION_SMOOTH_S / _STEP_S, axis=0)
+        gyro_bias = np.radians(o.gyro_bias_deg_s) * rng.standard_normal(3)
+        self._compass_phase = rng.uniform(0, 2 * np.pi, 2)
+        self.gyros = Triad.drawn(
+            generator(seed, "ins gyros"),
+            scale=o.gyro_scale,
+            scale_fixed=o.gyro_scale_fixed,
+            misalignment_deg=o.gyro_misalignment_deg,
+            bias=gyro_bias,
+        )
+        """Gyros in the ins frame [rad/s]."""
+        self.accelerometers = Triad.drawn(
+            generator(seed, "ins accelerometers"),
+            scale=o.accel_scale,
+            scale_fixed=o.accel_scale_fixed,
+            misalignment_deg=o.accel_misalignment_deg,
+            bias=o.accel_bias_m_s2,
+        )
+        """Accelerometers in the ins frame [m/s^2]."""
+        if outage is not None and outage.start_s > 0:
+            position = self._coasting(time_s, position, outage)
         self._position_error: BSpline = make_interp_spline(time_s, position, k=3)
         self._velocity_error: BSpline = self._position_error.derivative(1)
-        self._gyro_bias: Array = np.radians(o.gyro_bias_deg_s) * rng.standard_normal(3)
-        self._compass_phase = rng.uniform(0, 2 * np.pi, 2)
+
+    def _coasting(self, time_s: Array, error_m: Array, outage: Outage) -> Array:
+        """Errors of position where an outage is bridged by the accelerometers, shape (n, 3) [m].
+
+        The error of velocity at its start goes on, and gravity leaks in through the error of the tilt, as does the accelerometers' bias.
+        Afterwards the position goes back to the fixes. Heights are the barometer's throughout.
+        """
+        first, last = np.searchsorted(time_s, [outage.start_s, outage.end_s])
+        inside = slice(first, last + 1)
+        within_s = np.clip(time_s[inside], 0.0, self._flight.duration_s)
+        force = self._flight.specific_force_m_s2(within_s)
+        believed = mat_local_ins(*self._angles(within_s)) @ self.accelerometers.read(force)[..., None]
+        true = self._flight.poses(within_s).mat_local_ins() @ force[..., None]
+        start_m_s = (error_m[first] - error_m[first - 1]) / _STEP_S
+        velocity = start_m_s + np.cumsum((believed - true)[..., 0], axis=0) * _STEP_S
+        drift = np.cumsum(velocity, axis=0) * _STEP_S
+        coasted = error_m.copy()
+        coasted[inside, :2] = (error_m[first] + drift - drift[0])[:, :2]
+        left_s = (time_s[last + 1 :] - outage.end_s)[:, None]
+        away, speed = (coasted - error_m)[inside][-1, :2], velocity[-1, :2]
+        coasted[last + 1 :, :2] += (away + (speed + away / _RECOVERY_S) * left_s) * np.exp(-left_s / _RECOVERY_S)
+        return coasted
+
+    def _angles(self, time_s: Array) -> tuple[Array, Array, Array]:
+        """Heading, pitch and roll as believed [rad], shape (n,) each."""
+        poses, errors = self._flight.poses(time_s), np.asarray(self._angle_error(time_s))
+        return (
+            poses.heading_rad + errors[:, 0] + self.compass_error_rad(poses.heading_rad),
+            poses.pitch_rad + errors[:, 1],
+            poses.roll_rad + errors[:, 2],
+        )
 
     def compass_error_rad(self, heading_rad: Array) -> Array:
         """Error of the compass at a true heading: what metal on the frame does to it."""
@@ -82,11 +155,6 @@ class Ins:
         """Phases of the two harmonics of the compass error, shape (2,)."""
         return self._compass_phase
 
-    @property
-    def gyro_bias_rad_s(self) -> Array:
-        """Constant error of the gyros in the ins frame, shape (3,)."""
-        return self._gyro_bias
-
     def _gain(self, frequency_hz: Array) -> Array:
         """Amplitude of a second-order Butterworth low-pass."""
         return np.asarray(1.0 / np.sqrt(1.0 + (frequency_hz / self._options.gyro_filter_hz) ** 4))
@@ -96,19 +164,30 @@ class Ins:
         o = self._options
         # jitter and delay may point just outside the flight
         time_s = np.clip(time_s - o.gyro_delay_s, 0.0, self._flight.duration_s)
-        poses = self._flight.poses(time_s)
-        errors = np.asarray(self._angle_error(time_s))
-        rates = self._flight.rates_rad_s(time_s, self._gain) + self._gyro_bias
+        heading, pitch, roll = self._angles(time_s)
+        rates = self.gyros.read(self._flight.rates_rad_s(time_s, self._gain))
         rates = rates + np.radians(o.gyro_noise_deg_s) * rng.standard_normal(rates.shape)
-        force = self._flight.specific_force_m_s2(time_s)
+        force = self.accelerometers.read(self._flight.specific_force_m_s2(time_s))
         force = force + o.accel_noise_m_s2 * rng.standard_normal(force.shape)
-        position = poses.position_m + self._position_error(time_s)
+        place_s = time_s if not o.position_delay_s else np.clip(time_s - o.position_delay_s, 0.0, None)
+        position, velocity = self._place(place_s)
         return Belief(
-            heading_rad=poses.heading_rad + errors[:, 0] + self.compass_error_rad(poses.heading_rad),
-            pitch_rad=poses.pitch_rad + errors[:, 1],
-            roll_rad=poses.roll_rad + errors[:, 2],
+            heading_rad=heading,
+            pitch_rad=pitch,
+            roll_rad=roll,
             rates_frd_rad_s=ins_from_frd(rates),  # its own inverse
             force_frd_m_s2=ins_from_frd(force),
             position_m=position + o.position_noise_m * rng.standard_normal(position.shape),
-            velocity_m_s=self._flight.velocity_m_s(time_s) + self._velocity_error(time_s),
+            velocity_m_s=velocity,
         )
+
+    def _place(self, time_s: Array) -> tuple[Array, Array]:
+        """Position and velocity as believed, without white noise, shape (n, 3) each."""
+        poses = self._flight.poses(time_s)
+        position, velocity = poses.position_m, self._flight.velocity_m_s(time_s)
+        if self._antenna_m is not None:
+            mat = poses.mat_local_ins()
+            position = position + mat @ self._antenna_m
+            swing = np.cross(self._flight.rates_rad_s(time_s, self._gain), self._antenna_m)
+            velocity = velocity + np.einsum("nij,nj->ni", mat, swing)
+        return position + self._position_error(time_s), velocity + self._velocity_error(time_s)

@@ -122,11 +122,18 @@ class Lidar:
         rng = generator(seed, "lidar")
         self._bias_m = options.laser_bias_m * rng.standard_normal(LASERS)
         self._azimuth_start_deg = float(rng.uniform(0, 360))
+        lean = generator(seed, "lidar elevations").standard_normal(LASERS)
+        self._elevation_error_deg = options.elevation_error_deg * lean
 
     @property
     def laser_bias_m(self) -> Array:
         """True range error of each laser [m], shape (32,)."""
         return self._bias_m
+
+    @property
+    def elevation_error_deg(self) -> Array:
+        """True elevation of each laser minus that of the manual [deg], shape (32,)."""
+        return self._elevation_error_deg
 
     def packets_until(self, time_s: float) -> int:
         """How many packets start before a true time."""
@@ -171,7 +178,7 @@ class Lidar:
             poses.position_m + mat @ self._lever_m,
             mat @ self._mat_ins_lidar,
             np.unwrap(np.radians(turn_deg)),
-            np.radians(ELEVATION_DEG),
+            np.radians(ELEVATION_DEG + self._elevation_error_deg),
             LASER_NS / FIRING_NS,
             self._options.footprint_mrad * 1e-3,
             first_shot,

@@ -27,7 +27,7 @@ from simulator.capture import PcapWriter, tlog_record
 from simulator.chance import generator
 from simulator.clocks import Clocks, clocks
 from simulator.config import Options
-from simulator.faults import Reboot, arriving
+from simulator.faults import Outage, Reboot, arriving
 from simulator.flight import Flight
 from simulator.geodesy import Origin
 from simulator.ins import Ins
@@ -63,16 +63,32 @@ class Job:
     truth_points: bool = False
 
 
-def true_mount(nominal: Mount, options: Options) -> Mount:
-    """The mount as it really is, the nominal one changed by the options."""
-    yaw, pitch, roll = options.mount.boresight_deg
-    position = np.add(nominal.lidar.position_m, options.mount.lever_m)
-    return nominal.with_lidar(
-        position_m=tuple(float(v) for v in position),
+def logged_mount(scenes: Mount, options: Options) -> Mount:
+    """The nominal mount, as the log has it: the scene's, with the antenna of the options."""
+    return dataclasses.replace(scenes, gps_position_m=options.mount.gps_position_m)
+
+
+def true_mount(nominal: Mount, options: Options, seed: int) -> Mount:
+    """The mount as it really is, the nominal one changed by the options and by chance."""
+    o = options.mount
+    by_chance = generator(seed, "mount").uniform(-1.0, 1.0, (2, 3))
+    yaw, pitch, roll = np.add(o.boresight_deg, o.boresight_spread_deg * by_chance[0]).tolist()
+    position = np.add(nominal.lidar.position_m, o.lever_m) + o.lever_spread_m * by_chance[1]
+    antenna = nominal.gps_position_m
+    if any(o.gps_error_m):
+        antenna = _triple(np.add((0.0, 0.0, 0.0) if antenna is None else antenna, o.gps_error_m))
+    turned = nominal.with_lidar(
+        position_m=_triple(position),
         yaw_deg=nominal.lidar.yaw_deg + yaw,
         pitch_deg=nominal.lidar.pitch_deg + pitch,
         roll_deg=nominal.lidar.roll_deg + roll,
     )
+    return dataclasses.replace(turned, gps_position_m=antenna)
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 class Simulation:
@@ -85,8 +101,9 @@ class Simulation:
         self.clocks: Clocks = clocks(options.clocks)
         self.origin = Origin()
         self.flight = Flight(self.scene.route, job.duration_s, options.flight, seed)
-        self.mount = true_mount(self.scene.mount, options)
-        self.ins = Ins(self.flight, options.ins, seed)
+        self.nominal_mount = logged_mount(self.scene.mount, options)
+        self.mount = true_mount(self.nominal_mount, options, seed)
+        self.ins = Ins(self.flight, options.ins, seed, self.mount.gps_position_m, Outage.of(options.faults))
         self.lidar = Lidar(self.scene.world, self.flight, self.mount, self.clocks.lidar, options.lidar, seed)
         self.telemetry = Telemetry(self.flight, self.mount, self.clocks, options, self.origin, seed)
         self.autopilot = Autopilot(self.ins, self.clocks, options, self.origin, seed)
@@ -117,7 +134,7 @@ class Simulation:
         """All that is true and not a pose or a point."""
         job, link = self.job, self.autopilot.rates_hz
         lidar, boot = self.clocks.lidar, self.clocks.boot
-        reboot = Reboot.of(job.options.faults)
+        reboot, outage = Reboot.of(job.options.faults), Outage.of(job.options.faults)
         later = reboot.clock(reboot.end_s, boot) if 0 < reboot.start_s < job.duration_s else None
         return {
             "about": "Time t is true seconds since start; a clock shows start_ns + t * 1e9 * (1 + drift_ppm * 1e-6).",
@@ -133,16 +150,31 @@ class Simulation:
             "lidar_minus_boot_ns": lidar.start_ns - boot.start_ns,
             "lidar_minus_boot_ppm": lidar.drift_ppm - boot.drift_ppm,
             "ins_gyro_delay_s": job.options.ins.gyro_delay_s,
-            "mount_nominal": to_mapping(self.scene.mount),
+            "ins_position_delay_s": job.options.ins.position_delay_s,
+            "mount_nominal": to_mapping(self.nominal_mount),
             "mount_true": to_mapping(self.mount),
+            "boresight_deg": self._boresight_deg(),
+            "lever_m": np.subtract(self.mount.lidar.position_m, self.nominal_mount.lidar.position_m).tolist(),
+            "gps_outage_s": [outage.start_s, outage.end_s] if outage.start_s > 0 else None,
             "laser_bias_m": self.lidar.laser_bias_m.tolist(),
-            "ins_gyro_bias_deg_s": np.degrees(self.ins.gyro_bias_rad_s).tolist(),
+            "laser_elevation_error_deg": self.lidar.elevation_error_deg.tolist(),
+            "lidar_gyro_matrix": self.telemetry.gyros.matrix.tolist(),
+            "lidar_gyro_offset_deg_s": self.telemetry.gyros.bias.tolist(),
+            "ins_gyro_matrix": self.ins.gyros.matrix.tolist(),
+            "ins_gyro_bias_deg_s": np.degrees(self.ins.gyros.bias).tolist(),
+            "ins_accel_matrix": self.ins.accelerometers.matrix.tolist(),
+            "ins_accel_bias_m_s2": self.ins.accelerometers.bias.tolist(),
             "compass_phase_rad": self.ins.compass_phase_rad.tolist(),
             "mavlink_hz": link,
             "local_origin": dataclasses.asdict(self.origin),
             "surfaces": list(self.scene.world.names),
             "options": to_mapping(job.options),
         }
+
+    def _boresight_deg(self) -> list[float]:
+        """True minus nominal yaw, pitch and roll of the lidar."""
+        true, nominal = self.mount.lidar, self.nominal_mount.lidar
+        return [getattr(true, name) - getattr(nominal, name) for name in ("yaw_deg", "pitch_deg", "roll_deg")]
 
 
 def in_order(simulation: Simulation, workers: int) -> Iterator[Sweep]:
@@ -229,7 +261,7 @@ class Recording:
         return {"swath.session": session}
 
     def _attachments(self) -> dict[str, bytes]:
-        mount = self._simulation.scene.mount.yaml()
+        mount = self._simulation.nominal_mount.yaml()
         return {"mount.yaml": mount.encode(), "simulation.yaml": dump(self._options).encode()}
 
     def add(self, chunk: int, sweep: Sweep) -> None:

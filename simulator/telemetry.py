@@ -26,6 +26,7 @@ from simulator.clocks import Clocks
 from simulator.config import Options
 from simulator.flight import Flight
 from simulator.geodesy import Origin, geodetic
+from simulator.imu import Triad
 
 Array = npt.NDArray[np.float64]
 
@@ -68,6 +69,14 @@ class Telemetry:
         self._flight, self._clocks, self._origin, self._seed = flight, clocks, origin, seed
         self._options, self._locked = options.gyros, options.clocks.lidar_gps
         self._mat_lidar_ins = mount.mat_ins_lidar().T
+        self.gyros = Triad.drawn(
+            generator(seed, "telemetry gyros"),
+            scale=options.gyros.scale,
+            scale_fixed=options.gyros.scale_fixed,
+            misalignment_deg=options.gyros.misalignment_deg,
+            bias=np.array(options.gyros.offset_deg_s),
+        )
+        """Gyro 1, 2, 3 along the axes that the manual's figure gives them [deg/s]."""
         self._rotor_hz = options.lidar.rpm / 60.0
         rng = generator(seed, "telemetry times")
         count = int(flight.duration_s / 0.004) + 100
@@ -99,7 +108,7 @@ class Telemetry:
         o = self._options
         turn = 2 * np.pi * self._rotor_hz * time_s[:, None]
         rates = np.degrees(self._flight.rates_rad_s(time_s)) @ self._mat_lidar_ins.T
-        gyros = rates @ SENSOR_FROM_GYROS.astype(np.float64) + np.array(o.offset_deg_s)
+        gyros = self.gyros.read(rates @ SENSOR_FROM_GYROS.astype(np.float64))
         gyros = gyros + o.noise_deg_s * rng.standard_normal(gyros.shape)
         gyros = gyros + o.rotor_line_deg_s * np.sin(turn + np.array([0.3, 1.9, 3.1]))
         force = self._flight.specific_force_m_s2(time_s) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
