@@ -7,18 +7,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from simulator.config import Options
+    from simulator.plans import Plan
 
 HELP = "simulate a flight in a known world: flight log, pcap, tlog and the truth"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
-    parser.add_argument("--scene", default="village", metavar="NAME", help="village, field, facade or panels (village)")
-    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of flight (20)")
+    parser.add_argument(
+        "--flight",
+        metavar="NAME",
+        help="scene, duration and options of a named flight, or of a file; --flights lists them",
+    )
+    parser.add_argument("--flights", action="store_true", help="list the named flights and end")
+    parser.add_argument("--scene", metavar="NAME", help="village, field, facade or panels (village)")
+    parser.add_argument("--duration", type=float, metavar="S", help="seconds of flight (20)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same bytes (1)")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for what is written")
-    parser.add_argument("--config", type=Path, metavar="YAML", help="options; --sample-config shows all")
+    parser.add_argument(
+        "--config", type=Path, metavar="YAML", help="options, also of a flight; --sample-config shows all"
+    )
     parser.add_argument("--sample-config", action="store_true", help="print a commented file of all options and end")
     parser.add_argument(
         "--perfect", nargs="?", const="all", choices=("lidar", "ins", "all"),
@@ -47,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog import config
     from flightlog.errors import UsageError
+    from simulator import plans
     from simulator.config import Options
     from simulator.play import Target, play
     from simulator.render import CAPTURE, TLOG, Job, render
@@ -54,14 +63,19 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sample_config:
         print(config.sample(Options), end="")
         return 0
+    if arguments.flights:
+        for name in plans.names():
+            print(f"{name:20} {plans.plan(name).about}")
+        return 0
     if arguments.output is None:
         raise UsageError("no folder to write to; say -o DIR")
+    plan = _plan(arguments)
     job = Job(
-        arguments.scene,
-        arguments.duration,
+        plan.scene,
+        plan.duration_s,
         arguments.seed,
         arguments.output,
-        _options(arguments),
+        plan.options,
         arguments.workers,
         arguments.truth_points,
     )
@@ -91,22 +105,26 @@ def _announce(path: str) -> None:
     print(f"MAVLink on {path}", flush=True)
 
 
-def _options(arguments: argparse.Namespace) -> "Options":
-    """The options of the command line; UsageError for values that cannot be."""
-    from flightlog import config
+def _plan(arguments: argparse.Namespace) -> "Plan":
+    """What the command line asks for: a flight, changed by what else is said; UsageError for values that cannot be."""
     from flightlog.errors import UsageError
-    from simulator.config import Options, perfect
+    from simulator import plans
+    from simulator.config import perfect
 
+    plan = plans.Plan(duration_s=20.0) if arguments.flight is None else plans.plan(arguments.flight)
+    duration_s = plan.duration_s if arguments.duration is None else arguments.duration
     for value, least, name in (
-        (arguments.duration, 1.0, "--duration"),
+        (duration_s, 1.0, "--duration"),
         (arguments.seed, 0, "--seed"),
         (arguments.workers, 1, "--workers"),
     ):
         if not value >= least:
             raise UsageError(f"{name}: {value} found, expected at least {least:g}")
-    options = Options() if arguments.config is None else config.load(arguments.config, Options)
+    options = plan.options if arguments.config is None else plans.changed(plan.options, arguments.config)
     if arguments.returns is not None:
         options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, returns=arguments.returns))
     if arguments.dark:
         options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, dark=True))
-    return perfect(options, arguments.perfect) if arguments.perfect else options
+    if arguments.perfect:
+        options = perfect(options, arguments.perfect)
+    return dataclasses.replace(plan, scene=arguments.scene or plan.scene, duration_s=duration_s, options=options)

@@ -81,8 +81,10 @@ class ClockOptions:
 
 @dataclass(frozen=True, slots=True)
 class FlightOptions:
-    """Motion beyond the route."""
+    """Motion: along which route, how fast, and what comes on top."""
 
+    route: str = option("", "which of the scene's routes; empty: its first")
+    speed_m_s: float = option(0.0, "speed along the route; 0: the route's own [m/s]", minimum=0, maximum=50)
     vibration_deg: float = option(
         0.03, "rotor vibration of each attitude angle, rms [deg], 15 to 40 Hz", minimum=0, maximum=5
     )
@@ -237,7 +239,7 @@ class Options:
     lidar: LidarOptions = option(LidarOptions, "beams and rotor")
     gyros: GyroOptions = option(GyroOptions, "gyros and accelerometers inside the lidar")
     clocks: ClockOptions = option(ClockOptions, "clocks")
-    flight: FlightOptions = option(FlightOptions, "motion beyond the route")
+    flight: FlightOptions = option(FlightOptions, "motion")
     ins: InsOptions = option(InsOptions, "errors of the autopilot's estimates")
     link: LinkOptions = option(LinkOptions, "MAVLink link")
     mount: MountOptions = option(MountOptions, "true mount against nominal")

@@ -4,6 +4,7 @@ Attitude follows from the motion: a multirotor tilts its thrust into the acceler
 top comes vibration of the rotors, a sum of sines, which turns the frame but moves it nowhere.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -104,6 +105,8 @@ class Flight:
     def __init__(self, route: Route, duration_s: float, options: FlightOptions, seed: int) -> None:
         rng = generator(seed, "flight")
         share = _SHARE[route.kind]
+        if options.speed_m_s > 0:
+            route = dataclasses.replace(route, speed_m_s=options.speed_m_s)
         self.duration_s = duration_s
         self._vibration = _sines(rng, _VIBRATION_LINES, (15.0, 40.0), share * np.radians(options.vibration_deg))
         tilt = _sines(rng, _WANDER_LINES, (0.2, 3.0), share * np.radians(options.wander_deg))

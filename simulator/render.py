@@ -97,7 +97,7 @@ class Simulation:
     def __init__(self, job: Job) -> None:
         self.job = job
         options, seed = job.options, job.seed
-        self.scene: Scene = scene(job.scene, seed)
+        self.scene: Scene = scene(job.scene, seed, options.flight.route)
         self.clocks: Clocks = clocks(options.clocks)
         self.origin = Origin()
         self.flight = Flight(self.scene.route, job.duration_s, options.flight, seed)

@@ -88,7 +88,7 @@ def _add_reference_panels(parts: Parts) -> None:
         add_panel(parts, f"{material} upright", material, np.array([30.0 + 2.0 * i, 16.0, 0.9]), 200.0)
 
 
-def village(rng: np.random.Generator) -> tuple[World, Route]:
+def village(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     """A long house with recessed windows, garage, shed, bicycle shelter, trees, poles, wires, cars, on undulating ground."""
     parts = Parts()
     _add_ground(parts, 90.0, 0.5, rng)
@@ -126,10 +126,10 @@ def village(rng: np.random.Generator) -> tuple[World, Route]:
         ),
         speed_m_s=4.4,
     )
-    return parts.world(), route
+    return parts.world(), {"round": route}
 
 
-def field_scene(rng: np.random.Generator) -> tuple[World, Route]:
+def field_scene(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     """Flat level ground at height 0 and one plain wall that looks south: for tests of geometry. Flown in lines."""
     parts = Parts()
     parts.add("ground", "grass", quad((-400, -400, 0), (800, 0, 0), (0, 800, 0)))
@@ -137,10 +137,10 @@ def field_scene(rng: np.random.Generator) -> tuple[World, Route]:
     add_wall(parts, "wall", wall, (60.0, 8.0), None)
     lines = [(-20.0, -15.0), (20.0, -15.0), (20.0, -5.0), (-20.0, -5.0), (-20.0, 5.0), (20.0, 5.0)]
     points = [(x, y, 10.0 + rng.uniform(-1, 1)) for x, y in lines]
-    return parts.world(), Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0)
+    return parts.world(), {"lines": Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0)}
 
 
-def facade(rng: np.random.Generator) -> tuple[World, Route]:
+def facade(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     """A street between long facades at 30 m, driven by a car at 6 m/s."""
     parts = Parts()
     parts.add("street", "asphalt", quad((-250, -12, 0), (500, 0, 0), (0, 20, 0)))
@@ -158,10 +158,10 @@ def facade(rng: np.random.Generator) -> tuple[World, Route]:
         parts.add("lamps", "metal", prism(at, at + np.array([0, 0, 6.0]), 0.06, 8))
     points = ((-150.0, 0.0, 2.1), (150.0, 0.0, 2.1), (158.0, -4.0, 2.1), (150.0, -8.0, 2.1), (-150.0, -8.0, 2.1))
     route = Route(points_m=(*points, (-158.0, -4.0, 2.1)), speed_m_s=6.0, loop_from=0, kind="car")
-    return parts.world(), route
+    return parts.world(), {"street": route}
 
 
-def panels(rng: np.random.Generator) -> tuple[World, Route]:
+def panels(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     """Reference panels of 1 m2 at 5 to 60 m around a tripod: the sensor verification of the source's appendix B."""
     parts = Parts()
     parts.add("ground", "grass", quad((-300, -300, 0), (600, 0, 0), (0, 600, 0)))
@@ -173,11 +173,11 @@ def panels(rng: np.random.Generator) -> tuple[World, Route]:
         distance, heading = distances[i // 3], np.radians(headings[slot])
         at = np.array([distance * np.sin(heading), distance * np.cos(heading), 1.5])
         add_panel(parts, f"{material} at {distance:.0f} m", material, at, headings[slot] + 180.0)
-    return parts.world(), Route(points_m=((0.0, 0.0, 1.5),), heading_deg=0.0, kind="tripod")
+    return parts.world(), {"stand": Route(points_m=((0.0, 0.0, 1.5),), heading_deg=0.0, kind="tripod")}
 
 
 _LEVEL: Final = Mount(lidar=LidarMount(position_m=(0.0, 0.0, 0.0), pitch_deg=0.0))
-SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], tuple[World, Route]], Mount]]] = {
+SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], tuple[World, dict[str, Route]]], Mount]]] = {
     "village": (village, Mount()),
     "field": (field_scene, Mount()),
     "facade": (facade, Mount()),
@@ -185,16 +185,25 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], tuple[World, Route
 }
 
 
-def scene(name: str, seed: int) -> Scene:
+def scene(name: str, seed: int, route: str = "") -> Scene:
     """Build a scene by name; the seed places what is not fixed.
+
+    Parameters
+    ----------
+    name : str
+    seed : int
+    route : str
+        One of the scene's routes; empty: the first.
 
     Raises
     ------
     UsageError
-        No such scene.
+        No such scene, or no such route in it.
     """
     if name not in SCENES:
         raise UsageError(f"scene {name!r} is not known; known are {', '.join(SCENES)}")
     build, mount = SCENES[name]
-    world, route = build(generator(seed, f"scene {name}"))
-    return Scene(name, world, route, mount)
+    world, routes = build(generator(seed, f"scene {name}"))
+    if route and route not in routes:
+        raise UsageError(f"route {route!r} is not known in scene {name}; known are {', '.join(routes)}")
+    return Scene(name, world, routes[route or next(iter(routes))], mount)
