@@ -113,6 +113,12 @@ class InsOptions:
         minimum=0,
         maximum=90,
     )
+    compass_phase_deg: tuple[float, float] | None = option(
+        None,
+        "at which headings that error is: phase of its first and second harmonic, the same in every run [deg]; null: by seed",
+        minimum=-360,
+        maximum=360,
+    )
     compass_offset_deg: float = option(1.5, "constant heading error [deg]", minimum=-180, maximum=180)
     gyro_noise_deg_s: float = option(0.15, "white noise of a rate, one sigma [deg/s]", minimum=0, maximum=50)
     gyro_bias_deg_s: float = option(
@@ -278,7 +284,7 @@ def perfect(options: Options, part: str = "all") -> Options:
             clocks=dataclasses.replace(options.clocks, arrival_jitter_us=0.0),
         )
     if part in ("ins", "all"):
-        kept = ("gnss_tau_s", "gyro_filter_hz")
+        kept = ("gnss_tau_s", "gyro_filter_hz", "compass_phase_deg")
         fields = [field for field in dataclasses.fields(InsOptions) if field.name not in kept]
         zeros: dict[str, Any] = {
             field.name: (0.0, 0.0, 0.0) if isinstance(field.default, tuple) else 0.0 for field in fields

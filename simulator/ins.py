@@ -91,6 +91,8 @@ class Ins:
         position = gaussian_filter1d(np.stack([*across, up], axis=1), _POSITION_SMOOTH_S / _STEP_S, axis=0)
         gyro_bias = np.radians(o.gyro_bias_deg_s) * rng.standard_normal(3)
         self._compass_phase = rng.uniform(0, 2 * np.pi, 2)
+        if o.compass_phase_deg is not None:
+            self._compass_phase = np.radians(o.compass_phase_deg)
         self.gyros = Triad.drawn(
             generator(seed, "ins gyros"),
             scale=o.gyro_scale,

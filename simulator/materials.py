@@ -42,6 +42,9 @@ TABLE: Final = (
     Material("panel_81.3", 0.813),
     Material("retro", 60.0, 0.5),
     Material("cloth", 0.45),
+    # a mirror made rough by small waves: bright within some 10 deg of the vertical, black beyond; not of the source
+    Material("water", 0.3, 40.0),
+    Material("crop", 0.60, 0.4),
 )
 INDEX: Final = {material.name: i for i, material in enumerate(TABLE)}
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simulator.materials import INDEX
+from simulator.materials import INDEX, TABLE
+from simulator.meshes import placed
 
 Array = npt.NDArray[np.float64]
 
@@ -54,6 +55,11 @@ class Parts:
         self._triangles.append(triangles)
         self._materials.append(np.full(len(triangles), INDEX[material], np.uint8))
         self._surfaces.append(np.full(len(triangles), self._names.index(name), np.int32))
+
+    def place(self, other: "Parts", at: Array, heading_deg: float) -> None:
+        """Add what another collected, turned clockwise about its origin and moved to a place."""
+        for triangles, material, surface in zip(other._triangles, other._materials, other._surfaces, strict=True):
+            self.add(other._names[surface[0]], TABLE[material[0]].name, placed(triangles, at, heading_deg))
 
     def world(self) -> World:
         """Everything added so far."""

@@ -42,6 +42,32 @@ class Route:
     kind: str = "copter"
 
 
+def eights(
+    first_m: tuple[float, float], second_m: tuple[float, float], radius_m: float, heights_m: tuple[float, float]
+) -> tuple[tuple[float, float, float], ...]:
+    """Corner points of a figure eight round two centres: one lobe to the left, the other to the right.
+
+    Parameters
+    ----------
+    first_m, second_m : (east, north)
+        Centres; the eight crosses itself half-way between them.
+    radius_m : float
+        Of the lobes.
+    heights_m : (float, float)
+        Lowest and highest; each is reached once in a lobe.
+    """
+    angle = np.arange(15.0, 360.0, 30.0)
+    across = np.degrees(np.arctan2(second_m[1] - first_m[1], second_m[0] - first_m[0]))
+    middle, swing = (heights_m[0] + heights_m[1]) / 2, (heights_m[1] - heights_m[0]) / 2
+    points = []
+    for centre, start, sense in ((first_m, across, -1.0), (second_m, across + 180.0, 1.0)):
+        turn = np.radians(start + sense * angle)
+        north, east = centre[1] + radius_m * np.sin(turn), centre[0] + radius_m * np.cos(turn)
+        up = middle + swing * np.sin(np.radians(angle))
+        points += list(zip(east.tolist(), north.tolist(), up.tolist(), strict=True))
+    return tuple(points)
+
+
 def _corners(route: Route, length_m: float) -> Array:
     """Points in the order of visiting, far enough for a length."""
     points = [np.array(p, np.float64) for p in route.points_m]

@@ -19,9 +19,12 @@ from simulator.buildings import (
     add_wall,
 )
 from simulator.chance import generator
-from simulator.meshes import box, catenary, height_grid, prism, quad
+from simulator.ground import add_ground, ground_height
+from simulator.lake import lake
+from simulator.meshes import box, catenary, prism, quad
 from simulator.parts import Parts, World
-from simulator.route import Route
+from simulator.route import Route, eights
+from simulator.town import town
 
 Array = npt.NDArray[np.float64]
 
@@ -34,36 +37,6 @@ class Scene:
     world: World
     route: Route
     mount: Mount = field(default_factory=Mount)
-
-
-def ground_height(x_m: Array, y_m: Array) -> Array:
-    """Relief of the undulating ground: 12 cm over 20 m and 5 cm over 7 m, flat at 0 round the house; shape as given [m]."""
-    relief = 0.12 * np.sin(2 * np.pi * x_m / 20.0 + 0.4) * np.cos(2 * np.pi * y_m / 23.0)
-    relief += 0.05 * np.sin(2 * np.pi * (x_m + 0.6 * y_m) / 7.0)
-    outside_m = np.maximum(np.abs(x_m) - 22.0, np.abs(y_m) - 8.0)
-    return np.asarray(relief * np.clip(outside_m / 4.0, 0.0, 1.0))
-
-
-def _add_ground(parts: Parts, half_m: float, step_m: float, rng: np.random.Generator, grass_m: float = 0.015) -> None:
-    """Undulating grass with a street of asphalt, and bare soil far out."""
-    axis = np.arange(-half_m, half_m + step_m / 2, step_m)
-    x, y = np.meshgrid(axis, axis)
-    z = ground_height(x, y) + rng.normal(scale=grass_m, size=x.shape)
-    street = np.abs(y + 21.0) < 3.0
-    z[street] = -0.12
-    triangles = height_grid(axis, axis, z)
-    middle = triangles.mean(axis=1)
-    on_street = np.abs(middle[:, 1] + 21.0) < 3.0 - step_m
-    parts.add("grass", "grass", triangles[~on_street])
-    parts.add("street", "asphalt", triangles[on_street])
-    far_m = 300.0
-    for west, south, east, north in (
-        (-far_m, -far_m, far_m, -half_m),
-        (-far_m, half_m, far_m, far_m),
-        (-far_m, -half_m, -half_m, half_m),
-        (half_m, -half_m, far_m, half_m),
-    ):
-        parts.add("far ground", "soil", quad((west, south, -0.2), (east - west, 0, 0), (0, north - south, 0)))
 
 
 def _on_ground(x_m: float, y_m: float) -> Array:
@@ -91,7 +64,7 @@ def _add_reference_panels(parts: Parts) -> None:
 def village(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     """A long house with recessed windows, garage, shed, bicycle shelter, trees, poles, wires, cars, on undulating ground."""
     parts = Parts()
-    _add_ground(parts, 90.0, 0.5, rng)
+    add_ground(parts, 90.0, 0.5, rng)
     add_house(parts, "house", (40.0, 12.0), 6.0, 9.0, Windows(9, 2))
     parts.add("balcony", "concrete", box((-4.0, -7.4, 2.9), (4.0, -6.0, 3.05)))
     parts.add("canopy", "wood", box((10.0, 6.0, 2.5), (14.0, 7.6, 2.6)))
@@ -126,7 +99,11 @@ def village(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
         ),
         speed_m_s=4.4,
     )
-    return parts.world(), {"round": route}
+    # above all roofs: walls of four directions and roofs of two are seen from every side, in both directions
+    eight = eights((-15.0, 0.0), (15.0, 0.0), 12.0, (11.5, 14.0))
+    mirrored = tuple((x, -y, z) for x, y, z in eight)
+    both_ways = Route(points_m=((0.0, 0.0, 12.0), *eight, *mirrored), speed_m_s=6.0, smooth_s=0.7)
+    return parts.world(), {"round": route, "eights": both_ways}
 
 
 def field_scene(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
@@ -137,7 +114,8 @@ def field_scene(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     add_wall(parts, "wall", wall, (60.0, 8.0), None)
     lines = [(-20.0, -15.0), (20.0, -15.0), (20.0, -5.0), (-20.0, -5.0), (-20.0, 5.0), (20.0, 5.0)]
     points = [(x, y, 10.0 + rng.uniform(-1, 1)) for x, y in lines]
-    return parts.world(), {"lines": Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0)}
+    hover = Route(points_m=((0.0, -250.0, 10.0),), heading_deg=180.0)  # the wall is out of reach
+    return parts.world(), {"lines": Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0), "hover": hover}
 
 
 def facade(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
@@ -182,6 +160,8 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], tuple[World, dict[
     "field": (field_scene, Mount()),
     "facade": (facade, Mount()),
     "panels": (panels, _LEVEL),
+    "town": (town, Mount()),
+    "lake": (lake, Mount()),
 }
 
 

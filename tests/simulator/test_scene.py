@@ -1,13 +1,20 @@
 """The scenes hold what they promise, and shapes are what geometry says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flightlog.errors import UsageError
 from simulator.buildings import RECESS_M, Windows, add_wall
+from simulator.chance import generator
+from simulator.config import FlightOptions, Options
+from simulator.flight import Flight
 from simulator.materials import INDEX, TABLE
 from simulator.meshes import box, catenary, placed, prism, quad
 from simulator.parts import Parts
+from simulator.rays import Surfaces
+from simulator.route import eights
 from simulator.scene import SCENES, ground_height, scene
 
 
@@ -84,6 +91,57 @@ def test_reflectances_are_those_of_the_source():
     }  # fmt: skip
     for name, (low, high) in bounds.items():
         assert low <= TABLE[INDEX[name]].reflectance <= high
+
+
+@pytest.mark.parametrize(
+    ("name", "route", "seconds"),
+    [(n, r, 480.0 if r == "patrol" else 120.0) for n in SCENES for r in SCENES[n][0](generator(1, "x"))[1]],
+)
+def test_no_route_touches_anything(name, route, seconds):
+    built = scene(name, 2, route)
+    time_s = np.arange(0.0, seconds, 0.5)
+    position = Flight(built.route, seconds, FlightOptions(), 2).poses(time_s).position_m
+    away = np.random.default_rng(1).normal(size=(100, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    origins = np.repeat(position, 100, axis=0).astype(np.float32)
+    directions = np.tile(away, (len(time_s), 1)).astype(np.float32)
+    surfaces = Surfaces(built.world)
+    met = surfaces.opaque(origins, directions)
+    hit = met >= 0
+    plane = surfaces.planes[met[hit]]
+    normal = plane[:, :3]
+    distance = (plane[:, 3] - (normal * origins[hit]).sum(axis=1)) / (normal * directions[hit]).sum(axis=1)
+    assert distance.min() > 1.4
+    # not under the ground, where everything is seen from below
+    assert (directions[hit, 2] < 0).mean() > 0.6
+
+
+def test_an_eight_turns_both_ways_and_crosses_itself():
+    points = np.array(eights((-15.0, 0.0), (15.0, 0.0), 12.0, (10.0, 13.0)))
+    legs = np.diff(points[:, :2], axis=0)
+    turns = legs[:-1, 0] * legs[1:, 1] - legs[:-1, 1] * legs[1:, 0]
+    # clockwise round the first centre, counter-clockwise round the second; the two corners at the crossing are either
+    assert (turns[:10] < 0).all()
+    assert (turns[-10:] > 0).all()
+    assert np.hypot(points[:12, 0] + 15.0, points[:12, 1]) == pytest.approx(12.0)
+    assert points[:, 2].min() == pytest.approx(10.0, abs=0.1)
+    assert points[:, 2].max() == pytest.approx(13.0, abs=0.1)
+
+
+def test_water_returns_hardly_anything_and_the_shore_does(simulate):
+    options = Options()
+    sights = {
+        route: simulate("lake", 6.0, replace(options, flight=FlightOptions(route=route)), points=True)
+        for route in ("open", "out")
+    }
+    shots = {route: recorded.shots.payloads.shape[0] * 384 for route, recorded in sights.items()}
+    share = {route: len(recorded.points) / shots[route] for route, recorded in sights.items()}
+    assert share["open"] < 0.01
+    assert share["out"] > 0.1
+    water = sights["out"].truth["surfaces"].index("water")
+    seen = sights["out"].points[sights["out"].points["surface"] == water]
+    # what does come back comes from near the vertical
+    assert (len(seen) == 0) or (np.abs(seen["range_m"]).max() < 12.0)
 
 
 def test_an_unknown_scene_is_refused_with_the_known_ones():
