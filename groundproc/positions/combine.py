@@ -1,0 +1,225 @@
+"""A forward and a backward run over the same observations made into one solution, with sigmas that can be believed.
+
+RTKLIB does this itself (its solution type "combined"), but weighs both runs as if they were independent. They rest on the same
+observations: two fixes that agree are one fix, and two that do not agree are no better than their difference.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.constants import NS_PER_S
+from groundproc.positions.ellipsoid import ecef_from_geodetic, geodetic_from_ecef, mat_ecef_enu
+from groundproc.positions.solution import Quality, Solution
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+_SAME_EPOCH_NS: Final = 2_000_000
+_CHI2_999: Final = 16.266
+"""99.9 % of the squared distance in three dimensions, in units of its covariance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Combined:
+    """One solution of two, and how often the two agreed.
+
+    Attributes
+    ----------
+    solution : Solution
+    agreed : int
+        Epochs that both runs fixed to the same place.
+    contradicted : int
+        Epochs where fixes of the two, or a fix and the other's float, are not of one place.
+    unsupported : int
+        Fixes of one run that were too short to be believed alone.
+    """
+
+    solution: Solution
+    agreed: int
+    contradicted: int
+    unsupported: int
+
+
+def combined(forward: Solution, backward: Solution, shortest_fix_s: float) -> Combined:
+    """Combine a forward and a backward solution, epoch by epoch.
+
+    - Both fixed, at one place: their mean with the covariance of one; fixed.
+    - Both fixed, at two places: the one whose run of fixes lasts at least `shortest_fix_s`, if the other's does not; else their mean with
+      their difference as sigma, as float.
+    - One fixed: that, if its run of fixes lasts and lies within what the other's float allows; else the float, its covariance grown by
+      the difference where a lasting fix contradicts it.
+    - Both float: weighted by their covariances, which are grown by as much as the two contradict each other.
+    - Otherwise the better kind.
+
+    Parameters
+    ----------
+    forward, backward : Solution
+    shortest_fix_s : float
+        A fix of one run alone must last this long [s]: short ones are often wrong.
+    """
+    first, second = _pairs(forward, backward)
+    alone = np.ones(len(backward), bool)
+    alone[second] = False
+    merged = _merge(
+        forward.rows(first),
+        backward.rows(second),
+        _lasting(forward, shortest_fix_s)[first],
+        _lasting(backward, shortest_fix_s)[second],
+    )
+    others = np.ones(len(forward), bool)
+    others[first] = False
+    parts = [merged.solution, forward.rows(others), backward.rows(alone)]
+    return dataclasses.replace(merged, solution=_joined(parts))
+
+
+def _pairs(forward: Solution, backward: Solution) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Rows of both that are of one epoch."""
+    place = np.clip(np.searchsorted(backward.time_ns, forward.time_ns), 1, max(len(backward) - 1, 1))
+    before, after = place - 1, np.minimum(place, len(backward) - 1)
+    step = np.abs(backward.time_ns[before] - forward.time_ns) <= np.abs(backward.time_ns[after] - forward.time_ns)
+    nearest = np.where(step, before, after)
+    near = np.abs(backward.time_ns[nearest] - forward.time_ns) <= _SAME_EPOCH_NS
+    first = np.flatnonzero(near)
+    second, kept = np.unique(nearest[near], return_index=True)
+    return first[kept], second
+
+
+def _lasting(solution: Solution, shortest_s: float) -> Mask:
+    """Which rows belong to a run of fixes of at least this length."""
+    fixed = solution.quality == Quality.FIX
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], fixed, [False]]).astype(np.int8)))
+    found = np.zeros(len(fixed), bool)
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        found[start:end] = solution.time_ns[end - 1] - solution.time_ns[start] >= shortest_s * NS_PER_S
+    return found
+
+
+def _merge(forward: Solution, backward: Solution, forward_lasts: Mask, backward_lasts: Mask) -> Combined:
+    """Two solutions of the same epochs as one."""
+    f, b, c, spread, apart = _differences(forward, backward)
+    fix_f, fix_b = forward.quality == Quality.FIX, backward.quality == Quality.FIX
+    float_f, float_b = forward.quality == Quality.FLOAT, backward.quality == Quality.FLOAT
+    agree = apart <= _CHI2_999
+    # how far the result lies from the forward position towards the backward one, its covariance and its kind
+    n = len(forward)
+    share = np.zeros((n, 3, 3))
+    covariance, quality = f.copy(), forward.quality.copy()
+    one, nothing = np.eye(3), np.zeros((3, 3))
+
+    def put(rows: Mask, shares: Array, covariances: Array, kind: Quality) -> None:
+        share[rows] = shares[rows] if shares.ndim == 3 else shares
+        covariance[rows] = covariances[rows]
+        quality[rows] = kind
+
+    better_b = _rank(backward.quality) < _rank(forward.quality)
+    share[better_b], covariance[better_b], quality[better_b] = one, b[better_b], backward.quality[better_b]
+
+    both = fix_f & fix_b
+    put(both & agree, 0.5 * one, 0.5 * (f + b), Quality.FIX)
+    put(both & ~agree, 0.5 * one, 0.5 * (f + b) + spread, Quality.FLOAT)
+    put(both & ~agree & forward_lasts & ~backward_lasts, nothing, f, Quality.FIX)
+    put(both & ~agree & ~forward_lasts & backward_lasts, one, b, Quality.FIX)
+
+    for fixed, floating, lasts, at_fix, at_float, of_fix, of_float in (
+        (fix_f, float_b, forward_lasts, nothing, one, f, b),
+        (fix_b, float_f, backward_lasts, one, nothing, b, f),
+    ):
+        rows = fixed & floating
+        put(rows & ~lasts, at_float, of_float, Quality.FLOAT)
+        put(rows & lasts & ~agree, at_float, of_float + spread, Quality.FLOAT)
+        put(rows & lasts & agree, at_fix, of_fix, Quality.FIX)
+
+    weighted = np.linalg.solve(c, np.swapaxes(f, -1, -2))  # (f + b)^-1 f, so that the share is its transpose
+    grown = np.maximum(apart / 3.0, 1.0)[:, None, None]
+    put(float_f & float_b, np.swapaxes(weighted, -1, -2), (f - f @ weighted) * grown, Quality.FLOAT)
+
+    single = (fix_f & float_b & ~forward_lasts) | (fix_b & float_f & ~backward_lasts)
+    mixed = ((fix_f & float_b & forward_lasts) | (fix_b & float_f & backward_lasts)) & ~agree
+    return Combined(
+        _moved(forward, backward, share, covariance, quality),
+        agreed=int((both & agree).sum()),
+        contradicted=int(((both & ~agree) | mixed).sum()),
+        unsupported=int(single.sum()),
+    )
+
+
+def _rank(quality: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Position among the kinds from best to worst, shape (n,)."""
+    order = (
+        Quality.FIX,
+        Quality.FLOAT,
+        Quality.DGPS,
+        Quality.SBAS,
+        Quality.PPP,
+        Quality.SINGLE,
+        Quality.DEAD_RECKONING,
+    )
+    ranks = np.full(len(Quality), 255, np.uint8)
+    ranks[[int(kind) for kind in order]] = range(len(order))
+    return np.asarray(ranks[quality])
+
+
+def _differences(forward: Solution, backward: Solution) -> tuple[Array, Array, Array, Array, Array]:
+    """Covariances of both and their sum, the outer square of their difference, and that in units of the sum; east, north, up."""
+    d = _towards(forward, backward)
+    f, b = forward.covariance_m2, backward.covariance_m2
+    # RTKLIB's digits are 0.1 mm: a covariance of such sigmas may be singular by rounding
+    c = f + b + np.eye(3) * 1e-8
+    apart = np.einsum("ni,ni->n", d, np.linalg.solve(c, d[..., None])[..., 0])
+    return f, b, c, d[:, :, None] * d[:, None, :], apart
+
+
+def _towards(forward: Solution, backward: Solution) -> Array:
+    """East, north, up from forward to backward positions [m], shape (n, 3)."""
+    axes = mat_ecef_enu(forward.latitude_deg, forward.longitude_deg)
+    return np.asarray(np.einsum("nji,nj->ni", axes, _ecef(backward) - _ecef(forward)))
+
+
+def _ecef(solution: Solution) -> Array:
+    return ecef_from_geodetic(solution.latitude_deg, solution.longitude_deg, solution.height_m)
+
+
+def _moved(
+    forward: Solution, backward: Solution, share: Array, covariance: Array, quality: npt.NDArray[np.uint8]
+) -> Solution:
+    """The forward solution moved by a share of the way to the backward one."""
+    axes = mat_ecef_enu(forward.latitude_deg, forward.longitude_deg)
+    way = np.einsum("nij,njk,nk->ni", axes, share, _towards(forward, backward))
+    latitude, longitude, height = geodetic_from_ecef(_ecef(forward) + way)
+    ratio = forward.ratio
+    if ratio is not None and backward.ratio is not None:
+        # of the run that the position is of
+        ratio = np.where(np.einsum("nii->n", share) > 1.5, backward.ratio, ratio)
+    return dataclasses.replace(
+        forward,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        covariance_m2=covariance,
+        quality=quality,
+        ratio=ratio,
+        velocity_m_s=None,
+        velocity_covariance_m2_s2=None,
+    )
+
+
+def _joined(parts: list[Solution]) -> Solution:
+    """Solutions of different epochs as one in time order."""
+    names = (
+        "time_ns",
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+        "covariance_m2",
+        "quality",
+        "satellites",
+        "age_s",
+        "ratio",
+    )
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    whole = dataclasses.replace(parts[0], **columns, velocity_m_s=None, velocity_covariance_m2_s2=None)
+    return whole.rows(np.argsort(whole.time_ns, kind="stable"))
