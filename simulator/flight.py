@@ -152,7 +152,12 @@ class Flight:
         z = pitch_rate * np.sin(roll) - heading_rate * np.cos(pitch) * np.cos(roll)
         return np.stack([x, y, z], axis=1)
 
-    def specific_force_m_s2(self, time_s: Array) -> Array:
-        """What an ideal accelerometer at the INS reads, ins frame, shape (n, 3)."""
+    def specific_force_m_s2(self, time_s: Array, lever_m: Array | None = None) -> Array:
+        """What an ideal accelerometer reads, ins frame, shape (n, 3): at the INS, or at a lever arm from it [m]."""
         force = self._acceleration(time_s) + np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
-        return np.asarray(np.einsum("nij,ni->nj", self.poses(time_s).mat_local_ins(), force))
+        felt = np.einsum("nij,ni->nj", self.poses(time_s).mat_local_ins(), force)
+        if lever_m is not None:
+            rate, half_s = self.rates_rad_s(time_s), 1e-4
+            turning = (self.rates_rad_s(time_s + half_s) - self.rates_rad_s(time_s - half_s)) / (2.0 * half_s)
+            felt = felt + np.cross(turning, lever_m) + np.cross(rate, np.cross(rate, lever_m))
+        return np.asarray(felt)

@@ -68,7 +68,7 @@ class Telemetry:
     ) -> None:
         self._flight, self._clocks, self._origin, self._seed = flight, clocks, origin, seed
         self._options, self._locked = options.gyros, options.clocks.lidar_gps
-        self._mat_lidar_ins = mount.mat_ins_lidar().T
+        self._mat_lidar_ins, self._lever_m = mount.mat_ins_lidar().T, mount.lidar_position_m()
         self.gyros = Triad.drawn(
             generator(seed, "telemetry gyros"),
             scale=options.gyros.scale,
@@ -111,7 +111,7 @@ class Telemetry:
         gyros = self.gyros.read(rates @ SENSOR_FROM_GYROS.astype(np.float64))
         gyros = gyros + o.noise_deg_s * rng.standard_normal(gyros.shape)
         gyros = gyros + o.rotor_line_deg_s * np.sin(turn + np.array([0.3, 1.9, 3.1]))
-        force = self._flight.specific_force_m_s2(time_s) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
+        force = self._flight.specific_force_m_s2(time_s, self._lever_m) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
         # readings are the pull of gravity along the labelled arrow, minus the specific force: X up is -z on chips 1 and 2
         x, y, z = force.T
         accel = np.stack([z, -x, z, -y, x, -y], axis=1)
