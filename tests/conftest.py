@@ -52,13 +52,14 @@ class Simulated:
         return float(boot["start_ns"] * 1e-9 + elapsed_s * (1 + boot["drift_ppm"] * 1e-6) - lidar_s)
 
 
-def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int) -> None:
+def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int, points: bool) -> None:
     """All files of a simulation, with the lidar's data packets of one 0.1 s in `every` only: rays are what costs."""
-    from simulator.render import CAPTURE, LOG, POSES, TLOG, TRUTH, Job, Recording, Simulation
+    from simulator.render import CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Job, Recording, Simulation
     from simulator.truth import write_json
 
     simulation = Simulation(Job(scene, seconds, seed, folder, options))
-    with Recording(simulation, {name: folder / name for name in (LOG, CAPTURE, TLOG, POSES)}) as recording:
+    names = [LOG, CAPTURE, TLOG, POSES] + [POINTS] * points
+    with Recording(simulation, {name: folder / name for name in names}) as recording:
         for chunk in range(simulation.chunks):
             recording.add(chunk, simulation.sweep(chunk) if chunk % every == 0 else simulation.lidar.sweep(0, 0))
     write_json(folder / TRUTH, simulation.truth())
@@ -66,12 +67,14 @@ def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, e
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulated]:
-    """A function that simulates: simulated(name, scene, seconds, options, seed=..., every=...); the name is its folder."""
+    """A function that simulates: simulated(name, scene, seconds, options, seed=..., every=..., points=...); the name is its folder."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "simulated"
     shared.mkdir(exist_ok=True)
 
-    def get(name: str, scene: str, seconds: float, options: Any, *, seed: int = 5, every: int = 1) -> Simulated:
+    def get(
+        name: str, scene: str, seconds: float, options: Any, *, seed: int = 5, every: int = 1, points: bool = False
+    ) -> Simulated:
         folder, done = shared / name, shared / f"{name}.done"
         try:
             folder.mkdir()
@@ -81,7 +84,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulat
                 assert time.monotonic() < deadline, f"{name}: the worker that simulates it has not finished in 300 s"
                 time.sleep(0.1)
             return Simulated(folder)
-        _render(folder, scene, seconds, seed, options, every)
+        _render(folder, scene, seconds, seed, options, every, points)
         done.touch()
         return Simulated(folder)
 
@@ -136,6 +139,15 @@ def rebooted_flight(simulated: Callable[..., Simulated]) -> Simulated:
         link=replace(options.link, version=2),
     )
     return simulated("rebooted_flight", "village", 45.0, options, every=20)
+
+
+@pytest.fixture(scope="session")
+def judged_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """20 s round the village with all errors and a boresight that is off; the true echoes are there."""
+    from simulator.config import MountOptions, Options
+
+    options = replace(Options(), mount=MountOptions((0.6, -0.5, 0.8), (0.01, -0.02, 0.01)))
+    return simulated("judged_flight", "village", 20.0, options, every=10, points=True)
 
 
 @pytest.fixture(scope="session")
