@@ -13,6 +13,7 @@ from typing import BinaryIO, Final
 
 import lz4.frame
 import zstandard
+from fastcrc import crc32
 
 from flightlog.container import FOOTER_CHECKED_BYTES, MAGIC, RECORD_HEAD, Opcode
 
@@ -178,7 +179,7 @@ class McapWriter:
         plain = chunk.content()
         crc = 0
         for piece in plain:
-            crc = zlib.crc32(piece, crc)
+            crc = crc32.iso_hdlc(piece, crc)
         packed = _pack(plain, self._compression)
         packed_size = sum(map(len, packed))
         name = _string("" if self._compression == "none" else self._compression)

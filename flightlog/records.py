@@ -8,6 +8,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -327,13 +328,13 @@ class LidarAccount:
 
 
 _ACCOUNT: Final = struct.Struct("<9I2f")
+_ACCOUNT_VALUES: Final = attrgetter(*(field.name for field in fields(LidarAccount)))
 _HOST_CLOCK: Final = struct.Struct("<4q")
 
 
 def encode_account(stamp_ns: int, account: LidarAccount) -> bytes:
     """Encode a LidarAccount."""
-    values = [getattr(account, field.name) for field in fields(account)]
-    return _header(stamp_ns, "velodyne") + _ACCOUNT.pack(*values)
+    return _header(stamp_ns, "velodyne") + _ACCOUNT.pack(*_ACCOUNT_VALUES(account))
 
 
 def decode_account(data: bytes | memoryview) -> LidarAccount:

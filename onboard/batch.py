@@ -30,7 +30,7 @@ class Batch:
         log_time: LogTime,
         poll_s: float,
     ) -> None:
-        self._slots = np.zeros(slots, dtype)
+        self.slots = np.zeros(slots, dtype)
         self._time_ns = np.zeros(slots, np.int64)
         self._count = 0
         self._poll_ns = round(poll_s * NS_PER_S)
@@ -38,12 +38,12 @@ class Batch:
         self._log_time = log_time
         self._now = read_clocks()
         self._kernel_time = KernelTime(log_time, self._now)
-        self.receiver = Receiver(sock, self._slots, offset, size)
+        self.receiver = Receiver(sock, self.slots, offset, size)
 
     @property
     def full(self) -> bool:
         """Whether no slot is left."""
-        return self._count == len(self._slots)
+        return self._count == len(self.slots)
 
     def fill(self) -> int:
         """Take what is waiting, as far as there are slots; gives the number of datagrams."""
@@ -52,10 +52,8 @@ class Batch:
         if count:
             self._now = read_clocks()
             part = slice(first, first + count)
-            stamps_ns = self.receiver.stamps_ns[part]
-            stamps_ns[stamps_ns == 0] = self._now.realtime_ns
             self._time_ns[part] = self._kernel_time.convert(
-                stamps_ns, self._now, emptied=first + count < len(self._slots)
+                self.receiver.stamps_ns[part], self._now, emptied=first + count < len(self.slots)
             )
             self._count += count
         return count
@@ -73,7 +71,7 @@ class Batch:
         """Datagrams with receive time (in data packets also inside), their sizes, times and senders; valid until the next `fill`."""
         part = slice(0, self._count)
         self._count = 0
-        packets, time_ns = self._slots[part], self._time_ns[part]
+        packets, time_ns = self.slots[part], self._time_ns[part]
         if packets.dtype == SCAN_PACKET_DTYPE:
             records.set_receive_time_ns(packets, time_ns)
         return packets, self.receiver.sizes[part], time_ns, self.receiver.sources[part]

@@ -165,7 +165,7 @@ class Envelope:
             (x0, y0), (x1, y1) = _upper_edge(points)
             skew = min(max((y1 - y0) / (x1 - x0), -_SKEW_LIMIT), _SKEW_LIMIT)
         level = max(y - skew * x for x, y in points)
-        below = float(np.median([level + skew * x - y for x, y in points]))
+        below = sorted(level + skew * x - y for x, y in points)[len(points) // 2]
         offset_ns = base_ns + round(level + skew * (at_ns - begin_ns))
         uncertainty_ns = max(self._floor_ns, round(below))
         return ClockLine(at_ns, offset_ns, skew * 1e6, uncertainty_ns, self.samples, SyncMethod.ENVELOPE)

@@ -1,5 +1,6 @@
 """Start, run, stop. Signals set a flag; the watchdog is earned; whatever happens, the log is closed well."""
 
+import gc
 import logging
 import os
 import platform
@@ -82,7 +83,7 @@ class Daemon:
         # The ports first: packets wait in their buffers while the log is opened.
         self._recorder: Recorder | None = None
         self._only_armed = settings.recorder.lidar == "armed"
-        self._lidar = LidarPort(settings.lidar, self._log_time, self._put, self._is_flight)
+        self._lidar = LidarPort(settings.lidar, self._log_time, self._put, self._is_flight, self._handed_over)
         try:
             keep_free_bytes = 2 * settings.recorder.min_free_mb << 20
             self._salvager = leftovers.begin(self._directory, keep_free_bytes, settings.recorder.compression)
@@ -132,6 +133,10 @@ class Daemon:
             self._relay.offer(topic, data)
         return self._recorder.put(topic, log_time_ns, data, vital)
 
+    def _handed_over(self) -> None:
+        assert self._recorder is not None
+        self._recorder.handed_over()
+
     def _is_flight(self) -> bool:
         """Whether the lidar is to be recorded: where nobody can say that the vehicle is disarmed, it is."""
         if not self._only_armed:
@@ -155,6 +160,7 @@ class Daemon:
         """
         # A thread that computes gives way after 1 ms instead of 5: the lidar's must not wait for the writer's.
         sys.setswitchinterval(0.001)
+        gc.freeze()  # what was made so far is there to stay: no need to walk over it again and again
         for worker in reversed(self._workers):
             worker.start()
         self._salvager.start()

@@ -9,6 +9,7 @@ import errno
 import os
 import socket
 import struct
+import time
 from typing import Final
 
 import numpy as np
@@ -21,7 +22,7 @@ from onboard import packetfilter
 SO_TIMESTAMPNS: Final = 35
 SO_RXQ_OVFL: Final = 40
 SO_MEMINFO: Final = 55
-_MEMINFO: Final = struct.Struct("=9I")
+_MEMINFO: Final = struct.Struct("=II24xI")
 """What SO_MEMINFO gives (linux/sock_diag.h): first the bytes queued and the limit of the queue, last the drops."""
 MAX_DATAGRAMS: Final = 1024
 """The kernel takes no more in one call (UIO_MAXIOV)."""
@@ -99,7 +100,7 @@ class Receiver:
     sizes : ndarray of int64, shape (n,)
         Bytes of each datagram received.
     stamps_ns : ndarray of int64, shape (n,)
-        The kernel's receive time on the wall clock [ns]; 0 where it gave none.
+        The kernel's receive time on the wall clock [ns]; where it gave none, that of the call.
     drops : int
         Datagrams lost in the socket since it was opened, as far as known.
     refused : int
@@ -134,6 +135,9 @@ class Receiver:
         self._address = int(self._messages.ctypes.data)
         self._message_size, self._message_flags = self._messages["size"], self._messages["flags"]
         self._control_size = self._messages["control_size"]
+        # What the kernel tells of each datagram as three words: size of the control messages, flags, size.
+        self._told = self._messages.view(np.uint64).reshape(count, -1)[:, 5:]
+        self._usual = np.array([_WITH_TIME, 0, size], np.uint64)
         self._stamp_s, self._stamp_part_ns = self._control["sec"], self._control["nanosec"]
         self._sources = self._names["address"]
 
@@ -141,6 +145,12 @@ class Receiver:
     def sources(self) -> npt.NDArray[np.uint32]:
         """IPv4 address of each datagram's sender, shape (n,)."""
         return self._sources
+
+    def all_are(self, count: int, size: int, source: int | None) -> bool:
+        """Whether the first datagrams have this size and this sender, all of them; False where the sender is not known."""
+        if source is None or np.count_nonzero(self.sizes[:count] != size):
+            return False
+        return not np.count_nonzero(self._sources[:count] != source)
 
     def filter(self, payload_bytes: int, source: int) -> None:
         """Have the kernel refuse all but datagrams of one length from one IPv4 address."""
@@ -167,22 +177,25 @@ class Receiver:
             if error not in (0, errno.EAGAIN, errno.EINTR, errno.ECONNREFUSED, errno.ENETDOWN):
                 raise OSError(error, os.strerror(error))
             return 0
-        self._note(slice(first, first + count))
-        return count
-
-    def _note(self, part: slice) -> None:
-        self.sizes[part] = self._message_size[part]
-        flags = self._message_flags[part]
-        if int(np.bitwise_or.reduce(flags)) & socket.MSG_TRUNC:
-            self.sizes[part][flags & socket.MSG_TRUNC != 0] = self._limit + 1
-        control_size = self._control_size[part]
+        part = slice(first, first + count)
         stamps_ns = np.multiply(self._stamp_s[part], NS_PER_S, out=self.stamps_ns[part])
         stamps_ns += self._stamp_part_ns[part]
-        if control_size.min() < _WITH_TIME:
-            stamps_ns[control_size < _WITH_TIME] = 0
+        if np.count_nonzero(self._told[part] != self._usual):
+            self._note_unusual(part, stamps_ns)
+        else:
+            self.sizes[part] = self._limit
+        self._control_size[part] = _CONTROL_DTYPE.itemsize
+        return count
+
+    def _note_unusual(self, part: slice, stamps_ns: npt.NDArray[np.int64]) -> None:
+        """Some are shorter or longer, or the kernel told of drops, or gave no time."""
+        self.sizes[part] = self._message_size[part]
+        flags = self._message_flags[part]
+        self.sizes[part][flags & socket.MSG_TRUNC != 0] = self._limit + 1
+        control_size = self._control_size[part]
+        stamps_ns[control_size < _WITH_TIME] = time.time_ns()
         if control_size[-1] >= _WITH_DROPS and not self._is_filtered:
             self._count_drops(int(self._control["drops"][part][-1]), is_lost=True)
-        control_size[:] = _CONTROL_DTYPE.itemsize
 
     def count_last_drops(self) -> None:
         """Ask the kernel for drops that no later datagram has told of.
@@ -193,7 +206,7 @@ class Receiver:
         answer = self._sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 64)
         if len(answer) < _MEMINFO.size:
             return
-        queued, limit, *_, counter = _MEMINFO.unpack_from(answer)
+        queued, limit, counter = _MEMINFO.unpack_from(answer)
         is_crowded = queued > limit * _CROWDED
         self._count_drops(counter, is_lost=is_crowded or self._was_crowded or not self._is_filtered)
         self._was_crowded = is_crowded

@@ -5,6 +5,7 @@ turns, so a block stays if any of its shots lies inside.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,6 +16,9 @@ from flightlog.hdl32e import AZIMUTH_STEPS, FIRING_NS, LASER_NS, LASERS, ReturnM
 LARGEST_STEP: Final = 100
 """Upper bound on the azimuth from one firing to the next [0.01 deg]: three times the fastest head's (1200 rpm, 0.33 deg)."""
 
+_INSIDE: Final = 1
+_AHEAD: Final = 2
+"""Just ahead of the window: a block there may turn into it."""
 _LAST_SHOT_NS: Final = (LASERS - 1) * LASER_NS
 """When in a firing the last laser shoots [ns]."""
 
@@ -61,7 +65,8 @@ def apply(packets: npt.NDArray[np.void], window: Window) -> Masked:
     """
     if window.width == 0:
         return Masked(packets, 0, 0)
-    inside = blocks_inside(packets["data"]["blocks"]["azimuth"], packets["data"]["return_mode"], window)
+    data = packets["data"]
+    inside = blocks_inside(data["blocks"]["azimuth"], data["return_mode"], window)
     stays = np.asarray(inside.any(axis=1))
     kept = select(packets, stays)
     packet, block = np.nonzero(~inside[stays])
@@ -95,14 +100,24 @@ def blocks_inside(
     -------
     ndarray of bool, shape (n, 12)
     """
-    start = azimuth.astype(np.int32)
-    past = (start - window.start) % AZIMUTH_STEPS
-    inside = np.asarray(past <= window.width)
-    # Only a block just ahead of the window can turn into it; most packets have none.
-    near = (past > AZIMUTH_STEPS - LARGEST_STEP - 1).any(axis=1)
-    if near.any():
-        inside[near] |= _turns_in(start[near], return_mode[near], past[near])
+    where = np.take(_where(window), azimuth)
+    inside = np.asarray(where == _INSIDE)
+    ahead = where == _AHEAD
+    if ahead.any():  # in few packets
+        near = ahead.any(axis=1)
+        start = azimuth[near].astype(np.int32)
+        inside[near] |= _turns_in(start, return_mode[near], (start - window.start) % AZIMUTH_STEPS)
     return inside
+
+
+@lru_cache(maxsize=1)
+def _where(window: Window) -> npt.NDArray[np.uint8]:
+    """Where each azimuth lies, shape (65536,): a table, because a remainder costs ten times as much as a look into it."""
+    past = (np.arange(1 << 16) - window.start) % AZIMUTH_STEPS
+    out = np.zeros(past.shape, np.uint8)
+    out[past > AZIMUTH_STEPS - LARGEST_STEP - 1] = _AHEAD
+    out[past <= window.width] = _INSIDE
+    return out
 
 
 def _turns_in(

@@ -1,6 +1,5 @@
 """The status of everything aboard, and the verdict on it: what is wrong, by name. Pure: readings in, sentences out."""
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -174,7 +173,7 @@ def to_json(status: Status) -> str:
 
 
 def _fields(record: Any) -> dict[str, Any]:
-    return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    return {name: getattr(record, name) for name in record.__slots__}
 
 
 def from_json(text: str, place: str) -> Status:

@@ -63,14 +63,15 @@ def _last_boot(state: Path) -> tuple[str, int]:
 
 def write_atomically(path: Path, text: str, *, sync: bool = True) -> None:
     """Replace a file so that a reader, or a power cut, finds the old text or the new one."""
-    temporary = path.with_name(f".{path.name}.new")
-    with temporary.open("w", encoding="utf-8") as file:
+    temporary = f"{path.parent}/.{path.name}.new"
+    with open(temporary, "wb", buffering=0) as file:  # noqa: PTH123 - each second, and paths as objects take most of the time
         os.fchmod(file.fileno(), 0o644)  # whoever may enter the folder may read it, whatever the umask
-        file.write(text)
+        data = memoryview(text.encode())
+        while data:
+            data = data[file.write(data) :]
         if sync:
-            file.flush()
             os.fsync(file.fileno())
-    temporary.replace(path)
+    os.replace(temporary, path)  # noqa: PTH105
     if sync:
         sync_directory(path.parent)
 

@@ -4,6 +4,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -203,12 +204,17 @@ class Endurance:
         return round(max(0, free_bytes - floor_bytes) / rate / 60, 1)
 
 
+@cache
+def _sensors(zones: Path) -> list[Path]:
+    return sorted(zones.glob("thermal_zone*/temp"))
+
+
 def temperature_c(zones: Path = _THERMAL) -> float | None:
     """Of the hottest of the board's sensors; None: it has none."""
     found = []
-    for zone in zones.glob("thermal_zone*/temp"):
+    for sensor in _sensors(zones):
         with suppress(OSError, ValueError):
-            found.append(int(zone.read_text(encoding="ascii")) / 1000)
+            found.append(int(sensor.read_text(encoding="ascii")) / 1000)
     return max(found, default=None)
 
 

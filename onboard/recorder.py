@@ -30,6 +30,9 @@ _RESERVE_BYTES: Final = 4 << 20
 """Room of the backlog beyond its limit that only small messages may use, so that a stalled disk costs lidar packets first."""
 
 
+_TAKE_BYTES: Final = 1 << 20
+_NEARLY: Final = (7, 8)
+"""A sync is nearly due when this part of the time to it has passed."""
 _SLICE_NS: Final = 100 * NS_PER_MS
 """Writing goes on for at least this long between two syncs, however late the last one was."""
 _PRESSING: Final = 4
@@ -76,14 +79,16 @@ class Backlog:
             self.pressing.set()
         return True
 
-    def get(self) -> _Item | None:
-        """Take the oldest message, None if there is none."""
+    def get(self) -> list[_Item]:
+        """Take the oldest messages, about a megabyte of them."""
+        out: list[_Item] = []
         with self._lock:
-            if not self._items:
-                return None
-            item = self._items.popleft()
-            self.size_bytes -= len(item.data)
-            return item
+            size = 0
+            while self._items and size < _TAKE_BYTES:
+                out.append(self._items.popleft())
+                size += len(out[-1].data)
+            self.size_bytes -= size
+        return out
 
 
 @dataclass(slots=True)
@@ -131,6 +136,8 @@ class Recorder(Worker):
         self._retry_ns = 0
         self._told_drops = 0
         self._segment: Segment | None = None
+        self._taken: deque[_Item] = deque()
+        self._sync_soon = False
         self.backlog = Backlog(config.backlog_mb << 20)
         self.counts = RecorderCounts(last_sync_ns=time.monotonic_ns())
         self._look_at_space()
@@ -143,6 +150,12 @@ class Recorder(Worker):
             self.counts.refused_for_space += 1
             return False
         return self.backlog.put(topic, log_time_ns, data, vital)
+
+    def handed_over(self) -> None:
+        """Hear that all there is for now is in the backlog: where a sync is nearly due, it is best done now."""
+        if time.monotonic_ns() >= self.counts.last_sync_ns + self._sync_ns * _NEARLY[0] // _NEARLY[1]:
+            self._sync_soon = True
+            self.backlog.pressing.set()
 
     def rotate(self) -> None:
         """Ask for a new segment; soon, and not a message is lost for it."""
@@ -171,8 +184,9 @@ class Recorder(Worker):
     def _go_round(self) -> None:
         due_ns = self.counts.last_sync_ns + self._sync_ns
         self._until_full(lambda: self._write_until(due_ns))
-        if time.monotonic_ns() < due_ns:
+        if time.monotonic_ns() < due_ns and not self._sync_soon:
             return
+        self._sync_soon = False
         self._until_full(self._sync)
         self._look_at_space()
         if self.counts.space is Space.FULL:
@@ -184,7 +198,8 @@ class Recorder(Worker):
     def _write_until(self, end_ns: int | None) -> None:
         """Write the backlog; not beyond a time of the monotonic clock [ns] even if more and more comes."""
         begin_ns = time.monotonic_ns()
-        while (item := self.backlog.get()) is not None:
+        while self._taken or self._take():
+            item = self._taken.popleft()
             if self._segment is None:
                 self.counts.lost_on_disk += 1
                 continue
@@ -192,6 +207,11 @@ class Recorder(Worker):
             self.counts.messages += 1
             if end_ns is not None and time.monotonic_ns() >= max(end_ns, begin_ns + _SLICE_NS):
                 break
+
+    def _take(self) -> bool:
+        """Take the next messages from the backlog; whether there were any."""
+        self._taken.extend(self.backlog.get())
+        return bool(self._taken)
 
     def _sync(self) -> None:
         begin_ns = time.monotonic_ns()

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, Final, cast
 
 from flightlog import __version__
 from flightlog.constants import NS_PER_S
@@ -15,6 +15,9 @@ from flightlog.errors import LogError
 from flightlog.logfile import LogWriter
 from onboard import logfolder
 from onboard.logfolder import READ_ONLY, Entry, sync_directory
+
+_CHUNK_BYTES: Final = 3 << 19
+"""A little more than comes between two syncs, so that these close the chunks: one each, and little is lost with one."""
 
 
 class _HashedFile:
@@ -108,7 +111,7 @@ class Segment:
         try:
             self._writer = LogWriter(
                 cast(BinaryIO, self._file), metadata=metadata, attachments=attachments, library=f"swathd {__version__}",
-                compression=compression,
+                compression=compression, chunk_bytes=_CHUNK_BYTES,
             )  # fmt: skip
             for topic in topics:
                 self._writer.add_topic(topic)

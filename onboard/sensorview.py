@@ -1,6 +1,7 @@
 """What a lidar's packets tell of how it is set: speed, field of view, return mode, and the rate that follows from them. Pure."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -26,10 +27,10 @@ class SensorView:
     """A sensor whose own field of view is narrower sends fewer packets."""
 
 
-def sectors_seen(packets: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
-    """Which sectors the first blocks of packets of DATA_DTYPE lie in, shape (SECTORS,)."""
+def sectors_seen(azimuth: npt.NDArray[np.uint16]) -> npt.NDArray[np.bool_]:
+    """Which sectors azimuths [0.01 deg] lie in, shape (SECTORS,)."""
     seen = np.zeros(SECTORS, np.bool_)
-    seen[packets["blocks"]["azimuth"][:, 0] % AZIMUTH_STEPS // (AZIMUTH_STEPS // SECTORS)] = True
+    seen[azimuth % AZIMUTH_STEPS // (AZIMUTH_STEPS // SECTORS)] = True
     return seen
 
 
@@ -37,23 +38,26 @@ def view(packet: npt.NDArray[np.void], seen: npt.NDArray[np.bool_]) -> SensorVie
     """Look at one good packet, shape () or (1,) of DATA_DTYPE, and at the sectors of at least a turn."""
     one = packet.reshape(-1)[0]
     mode = int(one["return_mode"])
-    start, end = _widest(seen)
+    count = np.count_nonzero(seen)
+    start, end = _widest(seen) if count < SECTORS else (0.0, 0.0)
     return SensorView(
         return_mode=ReturnMode(mode).name.lower(),
         rpm=round(rpm(one), 0),
         fov_start_deg=start,
         fov_end_deg=end,
-        expected_packets_s=round(NS_PER_S / packet_ns(mode) * float(seen.mean()), 1),
+        expected_packets_s=round(NS_PER_S / packet_ns(mode) * count / SECTORS, 1),
     )
 
 
 def rpm(packet: np.void) -> float:
     """Turns per minute from the azimuths of a packet's blocks, but for steps over a gap in the field of view."""
-    first_of_firing = np.r_[True, np.diff(firing_index(int(packet["return_mode"]))) > 0]
-    azimuth = packet["blocks"]["azimuth"].astype(np.int64)[first_of_firing]
-    steps = np.diff(azimuth) % AZIMUTH_STEPS
-    usual = steps[steps <= 2 * np.median(steps)]  # azimuths are whole hundredths: a mean has more than a median
-    return float(usual.mean()) / AZIMUTH_STEPS * 60 * NS_PER_S / FIRING_NS
+    azimuth: list[int] = packet["blocks"]["azimuth"].tolist()
+    firing: list[int] = firing_index(int(packet["return_mode"])).tolist()
+    of_firing = [at for at, number, before in zip(azimuth, firing, [-1, *firing], strict=False) if number != before]
+    steps = [(after - before) % AZIMUTH_STEPS for before, after in pairwise(of_firing)]
+    largest = 2 * sorted(steps)[len(steps) // 2]
+    usual = [step for step in steps if step <= largest]  # azimuths are whole hundredths: a mean has more than a median
+    return sum(usual) / len(usual) / AZIMUTH_STEPS * 60 * NS_PER_S / FIRING_NS
 
 
 def _widest(seen: npt.NDArray[np.bool_]) -> tuple[float, float]:

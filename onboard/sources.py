@@ -130,7 +130,6 @@ class UdpSource(Source):
             count = self._receiver.receive()
             now: Clocks = read_clocks()
             stamps_ns = self._receiver.stamps_ns[:count]
-            stamps_ns[stamps_ns == 0] = now.realtime_ns
             times_ns = self._kernel_time.convert(stamps_ns, now, emptied=count < _UDP_SLOTS).tolist()
             sizes = self._receiver.sizes[:count].tolist()
             chunks += [
