@@ -43,8 +43,13 @@ class LidarConfig:
     interface: str | None = option(
         None, "network interface of the lidar, to tell a pulled cable; null: found by the lidar's address"
     )
+    only_interface: bool = option(
+        False, "refuse what comes in by any other: where others share the network, a sender's address proves nothing"
+    )
 
     def __post_init__(self) -> None:
+        if self.only_interface and self.interface is None:
+            raise ValueError("only_interface: true found, expected with a name for interface")
         if self.sensor is not None:
             IPv4Address(self.sensor)
 

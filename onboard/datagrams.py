@@ -152,10 +152,10 @@ class Receiver:
             return False
         return not np.count_nonzero(self._sources[:count] != source)
 
-    def filter(self, payload_bytes: int, source: int) -> None:
-        """Have the kernel refuse all but datagrams of one length from one IPv4 address."""
+    def filter(self, payload_bytes: int | None = None, source: int | None = None, interface: int | None = None) -> None:
+        """Have the kernel refuse all but datagrams of one length, from one IPv4 address, by the interface of one index."""
         self.count_last_drops()
-        packetfilter.attach(self._sock, payload_bytes, source)
+        packetfilter.attach(self._sock, packetfilter.program(payload_bytes, source, interface))
         self._is_filtered = True
 
     def unfilter(self) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import select
+import socket
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -147,6 +148,9 @@ class LidarPort(Worker):
         self._wanted, self._handed_over = wanted, handed_over
         self._sensor = None if config.sensor is None else address_number(config.sensor)
         self._is_pinned = config.sensor is not None
+        self._only_interface = config.interface if config.only_interface else None
+        self._interface: int | None = None
+        """Its index, where others are refused; 0: it is not there."""
         self._is_filtered = False
         self._heard_ns = time.monotonic_ns()
         self._looks: deque[npt.NDArray[np.uint16]] = deque(maxlen=_LOOKS)
@@ -179,6 +183,7 @@ class LidarPort(Worker):
             BATCH_NS / NS_PER_S,
         )
         self._told: set[str] = set()
+        self._open()
 
     def _pause_for_buffer(self, poll_s: float, asked_bytes: int) -> float:
         """Time between two polls that the receive buffer stands; a small one is told of."""
@@ -273,16 +278,31 @@ class LidarPort(Worker):
         if not self._is_filtered:
             self._is_filtered = True
             self.counts.sensor = address_text(self._sensor)
-            self._data.receiver.filter(hdl32e.DATA_BYTES, self._sensor)
-            self._position.receiver.filter(hdl32e.POSITION_BYTES, self._sensor)
+            self._data.receiver.filter(hdl32e.DATA_BYTES, self._sensor, self._interface)
+            self._position.receiver.filter(hdl32e.POSITION_BYTES, self._sensor, self._interface)
+
+    def _open(self) -> None:
+        """Let in what comes by the lidar's interface, whatever it is; without a name for that, everything."""
+        if self._only_interface is None:
+            self._data.receiver.unfilter()
+            self._position.receiver.unfilter()
+            return
+        try:
+            index = socket.if_nametoindex(self._only_interface)
+        except OSError:
+            index = 0
+        for batch in (self._data, self._position):
+            batch.receiver.filter(interface=index)
+        self._interface = index
 
     def _watch_sensor(self, now_ns: int) -> None:
         """Let everything in while the lidar is silent, to tell why it is."""
         silent_ns = now_ns - self._heard_ns
         if self._is_filtered and silent_ns > _OPEN_NS:
             self._is_filtered = False
-            self._data.receiver.unfilter()
-            self._position.receiver.unfilter()
+            self._open()
+        elif not self._is_filtered and self._only_interface is not None:
+            self._open()  # it may have come, or come back with another index
         if self._sensor is not None and not self._is_pinned and silent_ns > _FORGET_NS:
             _log.warning("the lidar at %s is silent; it may come back from another address", self.counts.sensor)
             self._sensor = None

@@ -23,13 +23,18 @@ class Port:
     """A lidar port of ours and what it handed over."""
 
     def __init__(
-        self, address: str = "127.0.0.1", sensor: str | None = None, ports: tuple[int, int] | None = None
+        self,
+        address: str = "127.0.0.1",
+        sensor: str | None = None,
+        ports: tuple[int, int] | None = None,
+        interface: str | None = None,
     ) -> None:
         self.ports = ports or (free_port(), free_port())
         self.messages: list[tuple[str, bytes]] = []
         config = LidarConfig(
-            address, *self.ports, poll_ms=20, receive_buffer_kb=2048, fov=FovConfig(0, 0), sensor=sensor
-        )
+            address, *self.ports, poll_ms=20, receive_buffer_kb=2048, fov=FovConfig(0, 0), sensor=sensor,
+            interface=interface, only_interface=interface is not None,
+        )  # fmt: skip
         self.log_time = LogTime.start(read_clocks())
         self.port = LidarPort(config, self.log_time, self.put)
         self.port.start()
@@ -209,6 +214,49 @@ def test_the_addresses_of_new_firmware_are_heard_and_broadcasts_of_others_refuse
         assert port.marks() == {1: 300}
         assert port.account("rejected_sender") == 299 * 5
         assert port.account("kernel_drops") == 0
+
+
+@pytest.mark.root
+def test_the_lidars_own_address_by_another_interface_is_refused_and_the_interface_may_come_late() -> None:
+    needs_namespaces()
+    lidar_address, forged = "192.168.1.201", packet(7, mark=66)
+    with cable(["192.168.1.10/24"], [f"{lidar_address}/24"]) as (aboard, sensor):
+        run("ip", "-n", aboard, "link", "set", "lidar0", "name", "late0")
+        port = inside(aboard, lambda: Port("0.0.0.0", ports=(2368, 8308), interface="lidar0"))
+        # on another cable of the vehicle somebody says that it is the lidar
+        run("ip", "-n", aboard, "link", "add", "other0", "type", "veth", "peer", "name", "evil0", "netns", sensor)
+        run("ip", "-n", aboard, "link", "set", "other0", "up")
+        run("ip", "-n", sensor, "link", "set", "evil0", "up")
+        attacker = inside(sensor, lambda: from_address(lidar_address))
+        attacker.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"evil0")
+
+        def forge(count: int) -> None:
+            for _ in range(count):
+                attacker.sendto(forged, ("192.168.1.10", 2368))
+
+        def head(first: int, last: int) -> None:
+            with inside(sensor, lambda: from_address(lidar_address, 2368)) as sock:
+                for number in range(first, last):
+                    sock.sendto(packet(number), ("192.168.1.10", 2368))
+
+        with attacker:
+            forge(10)
+            head(0, 10)  # by the right cable, but the interface has another name yet
+            time.sleep(0.3)
+            assert port.marks() == {}
+            run("ip", "-n", aboard, "link", "set", "late0", "down")
+            run("ip", "-n", aboard, "link", "set", "late0", "name", "lidar0")
+            run("ip", "-n", aboard, "link", "set", "lidar0", "up")
+            time.sleep(0.3)
+            forge(10)
+            head(10, 50)
+            until(lambda: port.port.counts.sensor == lidar_address)
+            forge(10)
+            head(50, 100)
+        port.stop()
+    assert port.marks() == {1: 90}
+    assert port.account("rejected_sender") == 40  # 30 forged ones, and ten by an interface that was not yet the lidar's
+    assert port.account("kernel_drops") == 0
 
 
 @pytest.mark.parametrize(("lose", "mode", "state"), [(4, 0x37, "rate low"), (0, 0x37, "good"), (0, 0x39, "rate low")])
