@@ -11,9 +11,15 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
-NO_BENCHMARKS = ("all", "long_log")
+NO_BENCHMARKS = ("all", "drawing", "long_log", "machine")
 """This one, and what others use."""
-LIBRARIES = ("swath", "numpy", "numba", "scipy", "mcap", "laspy", "lazrs", "pyproj", "pymavlink", "velodyne-decoder")
+LIBRARIES = (
+    "swath", "numpy", "numba", "scipy", "mcap", "laspy", "lazrs", "pyproj", "pymavlink", "velodyne-decoder", "kiss-icp", "small_gicp",
+)  # fmt: skip
+
+
+NOTES = {"trajectory": "What the figures mean and how they are taken: [accuracy.md](accuracy.md)."}
+"""What a section says before its figures."""
 
 
 def run(script: Path) -> dict[str, Any] | None:
@@ -56,7 +62,13 @@ def versions() -> dict[str, str]:
 
 
 def table(rows: dict[str, Any]) -> str:
-    """A table of names and values."""
+    """A table of names and values; one line for each name where every value is an object of its own."""
+    if rows and all(isinstance(value, dict) for value in rows.values()):
+        columns = list(dict.fromkeys(key for value in rows.values() for key in value))
+        lines = ["| |" + "".join(f" `{key}` |" for key in columns), "|---" * (len(columns) + 1) + "|"]
+        for name, value in rows.items():
+            lines.append(f"| {name} |" + "".join(f" {show(value.get(key, ''))} |" for key in columns))
+        return "\n".join(lines)
     lines = ["| figure | value |", "|---|---|"]
     return "\n".join([*lines, *(f"| `{name}` | {show(value)} |" for name, value in rows.items())])
 
@@ -65,7 +77,7 @@ def show(value: Any) -> str:
     """A value as the page shows it: four digits are more than a noisy machine is good for."""
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
-    return json.dumps(value) if isinstance(value, (dict, list)) else str(value)
+    return json.dumps(value) if isinstance(value, (dict, list)) else "-" if value is None else str(value)
 
 
 def main() -> int:
@@ -73,7 +85,9 @@ def main() -> int:
     scripts = sorted(ROOT.glob("benchmarks/[a-z]*.py"))
     results = {script.stem: run(script) for script in scripts if script.stem not in NO_BENCHMARKS}
     sections = [
-        f"## {name}\n\n`make bench-{name}`\n\n" + ("It failed." if figures is None else table(figures))
+        f"## {name}\n\n`make bench-{name}`\n\n"
+        + (f"{NOTES[name]}\n\n" if name in NOTES else "")
+        + ("It failed." if figures is None else table(figures))
         for name, figures in results.items()
     ]
     machine = f"{processor()}, {os.cpu_count()} processors, {platform.system()} {platform.release()}"

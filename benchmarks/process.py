@@ -33,6 +33,7 @@ import lazrs
 import numpy as np
 import numpy.typing as npt
 from long_log import write_long_log
+from machine import busy_s
 
 ROUNDS: Final = 5
 FLIGHT_S: Final = 30
@@ -49,12 +50,6 @@ class Run:
     other_load: float
     """Cores that other programs took meanwhile."""
     peak_mb: float = 0.0
-
-
-def busy_s() -> float:
-    """CPU time that all programs, the kernel and other guests of the host have taken on this machine [s]."""
-    user, nice, system, _, _, irq, softirq, steal = map(int, Path("/proc/stat").read_text().split("\n")[0].split()[1:9])
-    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
 
 def swath(*words: str | Path) -> tuple[float, float]:

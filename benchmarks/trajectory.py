@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from machine import busy_s
 
 from flightlog.errors import SwathError
 from flightlog.logfile import LogReader
@@ -62,10 +63,12 @@ TABLE: Final = (
     ("facade_floor_ratio", "/ floor", ".2f"),
     ("ground_revolution_floor_ratio", "ground of revolutions / floor", ".2f"),
     ("ground_strip_floor_ratio", "ground of strips / floor", ".2f"),
+    ("time_error_ms", "time [ms]", ".2f"),
     ("heading_rms_deg", "heading [deg]", ".3f"),
     ("heading_settle_s", "settles [s]", ".1f"),
     ("real_time_factor", "x real time", ".2f"),
     ("cpu_s_per_flight_s", "CPU s per s", ".2f"),
+    ("other_load", "others' cores", ".2f"),
     ("peak_memory_mb", "memory [MB]", ".0f"),
 )
 TRUTH: Final = "truth"
@@ -85,6 +88,8 @@ class Made:
     absolute: bool
     wall_s: float
     cpu_s: float
+    other_load: float
+    """Cores that other programs took meanwhile."""
     warning: str = ""
 
 
@@ -113,6 +118,18 @@ def cpu_s() -> float:
     return sum(each.ru_utime + each.ru_stime for each in used)
 
 
+class Cost:
+    """Measures time from its making on."""
+
+    def __init__(self) -> None:
+        self._start, self._cpu, self._busy = time.perf_counter(), cpu_s(), busy_s()
+
+    def so_far(self) -> tuple[float, float, float]:
+        """Wall time [s], CPU time [s], and the cores that other programs took."""
+        wall, cpu = time.perf_counter() - self._start, cpu_s() - self._cpu
+        return wall, cpu, max(0.0, busy_s() - self._busy - cpu) / wall
+
+
 def peak_mb() -> float:
     """Highest resident memory of this program [MB]; getrusage would hold that of the one that started it too."""
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -122,7 +139,7 @@ def peak_mb() -> float:
 def make(name: str, truth: Truth, reader: LogReader) -> Made:
     """Make the trajectory of a method or peer, timed from the closed log on."""
     if name == TRUTH:
-        return Made(truth.trajectory, truth.mount, None, True, float("nan"), float("nan"))
+        return Made(truth.trajectory, truth.mount, None, True, 0.0, 0.0, 0.0)
     return _odometry(name, truth, reader) if name in peers() else _method(name, truth, reader)
 
 
@@ -130,16 +147,16 @@ def _method(name: str, truth: Truth, reader: LogReader) -> Made:
     survey = Survey(method=name.removesuffix("_causal"))
     if name.endswith("_causal"):
         survey = replace(survey, causal=True)
-    start, used = time.perf_counter(), cpu_s()
+    cost = Cost()
     mount, _ = find_mount(None, [reader])
     flight = read_flight([reader], "ins")
     timeline = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), survey.sync)
     estimate = methods.estimate(gather([reader], flight, timeline, mount, survey), lambda stage, size: None)
-    wall, cpu = time.perf_counter() - start, cpu_s() - used
+    spent = cost.so_far()
     if len({leg.run for leg in timeline}) > 1:
         raise SystemExit(f"{reader.path}: the lidar's clock was set in flight, expected one run of it")
     placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
-    return Made(placed, estimate.mount, estimate.lasers, True, wall, cpu, estimate.warning)
+    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning)
 
 
 def _odometry(name: str, truth: Truth, reader: LogReader) -> Made:
@@ -147,17 +164,17 @@ def _odometry(name: str, truth: Truth, reader: LogReader) -> Made:
     from peers.odometries import NEEDS_GYROS, PEERS
     from peers.scans import scans
 
-    start, used = time.perf_counter(), cpu_s()
+    cost = Cost()
     mount, motion = truth.nominal_mount, None
     if name in NEEDS_GYROS:
         flight = read_flight([reader], "ins")
         timeline = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), "auto")
         motion = gyros(timeline[0], flight.runs[timeline[0].run], mount)
     poses = PEERS[name](scans([reader]), motion)
-    wall, cpu = time.perf_counter() - start, cpu_s() - used
+    spent = cost.so_far()
     found = dense(poses, motion, mount, truth.frame)
     found = replace(found, time_ns=truth.from_device_ns(found.time_ns))
-    return Made(found, mount, None, False, wall, cpu)
+    return Made(found, mount, None, False, *spent)
 
 
 def one(name: str, folder: Path, results: Path, section: Section | None) -> None:
@@ -167,13 +184,15 @@ def one(name: str, folder: Path, results: Path, section: Section | None) -> None
         reader = stack.enter_context(LogReader(truth.log))
         made = make(name, truth, reader)
         memory_mb = peak_mb()
-        found = judge([reader], truth, made.trajectory, made.mount, made.lasers, section, made.absolute)
+        readers = [reader] if truth.has_hits else []
+        found = judge(readers, truth, made.trajectory, made.mount, made.lasers, section, made.absolute)
     figures: dict[str, Any] = {"real_time_factor": None}
     if made.wall_s > 0:
         figures = {
             "real_time_factor": truth.duration_s / made.wall_s,
             "cpu_s_per_flight_s": made.cpu_s / truth.duration_s,
             "peak_memory_mb": memory_mb,
+            "other_load": made.other_load,
         }
     figures |= {"warning": made.warning} if made.warning else {}
     (results / f"{name}.json").write_text(json.dumps(found.figures | figures, indent=1) + "\n")
@@ -240,7 +259,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, dict[str, 
     if unknown:
         raise SystemExit(f"--methods: {unknown[0]!r} found, expected some of {', '.join([*own, *others])}")
     truth = read_truth(flight)
-    section = choose_section(truth)
+    section = choose_section(truth) if truth.has_hits else None
     _write_section(results, section)
     found = {TRUTH: run(TRUTH, flight, results)}
     if not arguments.cold:

@@ -79,6 +79,9 @@ def judge(
     figures: dict[str, Any] = asdict(poses.pose_figures(lidar, true_lidar))
     figures |= {"covered_time_share": share, "aligned_by_attitude": motion.by_attitude}
     figures |= {f"ins_{name}": value for name, value in asdict(poses.pose_figures(ours.moved(alone), theirs)).items()}
+    figures["time_error_ms"] = poses.time_error_ms(lidar, true_lidar)
+    if absolute:
+        figures["boresight_error_deg"], figures["lever_error_m"] = poses.mount_errors(mount, truth.mount)
     heading = poses.heading_errors_deg(ours.moved(motion), theirs)
     settled = poses.wrapped_deg(heading - poses.settled_offset_deg(heading))
     figures["heading_settle_s"] = poses.settle_s(ours.time_ns, settled)

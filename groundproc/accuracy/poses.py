@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from flightlog.mount import Mount
@@ -108,6 +109,37 @@ def pose_figures(estimated: PoseSeries, true: PoseSeries) -> PoseFigures:
         rpe_m=rpe_m,
         rpe_deg=rpe_deg,
     )
+
+
+def time_error_ms(estimated: PoseSeries, true: PoseSeries) -> float | None:
+    """By how much the estimated attitude is ahead: at t it is that of t plus this [ms]; None where nothing turns.
+
+    The part of the body rate's error that goes with the angular acceleration, by least squares. Rates do not know of a heading that is
+    off; vibration, too fast for the grid, is smoothed away.
+    """
+    step = round(0.1e9 / GRID_NS)
+    if len(true.time_ns) <= 2 * step:
+        return None
+    rate, true_rate = (
+        uniform_filter1d(_rates(series), step, axis=0, mode="nearest")[step:-step] for series in (estimated, true)
+    )
+    growth = np.gradient(true_rate, GRID_NS * 1e-9, axis=0)
+    power = float(np.square(growth).sum())
+    return float(((rate - true_rate) * growth).sum()) / power * 1e3 if power > 1e-6 else None
+
+
+def _rates(series: PoseSeries) -> Array:
+    """Body rates [rad/s] between the poses before and after each inner one, shape (n - 2, 3)."""
+    span_s = (series.time_ns[2:] - series.time_ns[:-2]) * 1e-9
+    turn = np.swapaxes(series.mat_local_body[:-2], 1, 2) @ series.mat_local_body[2:]
+    return _vectors(turn) / span_s[:, None]
+
+
+def mount_errors(estimated: Mount, true: Mount) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Boresight error about the lidar's x, y and z [deg], and the lever arm's along the axes of the INS [m]."""
+    turn = true.mat_ins_lidar().T @ estimated.mat_ins_lidar()
+    lever = estimated.lidar_position_m() - true.lidar_position_m()
+    return tuple(np.rad2deg(_vectors(turn[None])[0]).tolist()), tuple(lever.tolist())
 
 
 def position_errors(estimated: PoseSeries, true: PoseSeries) -> Array:

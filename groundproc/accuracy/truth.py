@@ -28,6 +28,7 @@ from groundproc.trajectory.trajectory import Trajectory
 Times = npt.NDArray[np.int64]
 
 LOG: Final = "flight.mcap"
+HITS: Final = "truth_points.npy"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +93,15 @@ class Truth:
         LogError
             The flight was simulated without them.
         """
-        path = self.folder / "truth_points.npy"
-        if not path.is_file():
+        path = self.folder / HITS
+        if not self.has_hits:
             raise LogError(f"{path}: is not there; the flight must be simulated with --truth-points")
         return Hits(np.load(path, mmap_mode="r"), self.lidar.start_ns)
+
+    @property
+    def has_hits(self) -> bool:
+        """Whether the flight was simulated with its true echoes."""
+        return (self.folder / HITS).is_file()
 
     def from_device_ns(self, device_ns: Times) -> Times:
         """The lidar's clock as the truth counts it, of times that a reader carried on over the hours, shape (n,)."""

@@ -144,6 +144,25 @@ def test_a_boresight_is_a_constant_rotation_of_the_lidar_and_none_of_the_ins(tru
     assert np.linalg.norm(figures["body_offset_deg"]) == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_shift_in_time_is_told_from_other_errors(truth: Truth) -> None:
+    # its states come 3 ms later than they were, and a heading that is off by up to 8 deg hides it
+    late = replace(truth.trajectory, time_ns=truth.trajectory.time_ns + 3_000_000)
+    share = np.linspace(0.0, 1.0, len(late))
+    drift = Rotation.from_rotvec(share[:, None] * [0.0, 0.0, np.deg2rad(8.0)])
+    figures = judge([], truth, turned(late, drift), truth.mount).figures
+    assert figures["time_error_ms"] == pytest.approx(-3.0, abs=0.15)
+    assert judge([], truth, truth.trajectory, truth.mount).figures["time_error_ms"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_errors_of_a_mount_by_axes(truth: Truth) -> None:
+    right, forward, up = truth.mount.lidar.position_m
+    # pitch is the last turn but one about x, and there is no roll to speak of in between
+    mount = truth.mount.with_lidar(pitch_deg=truth.mount.lidar.pitch_deg + 0.2, position_m=(right + 0.03, forward, up))
+    figures = judge([], truth, truth.trajectory, mount).figures
+    assert figures["boresight_error_deg"] == pytest.approx((0.2, 0.0, 0.0), abs=0.005)
+    assert figures["lever_error_m"] == pytest.approx((0.03, 0.0, 0.0), abs=1e-9)
+
+
 @pytest.mark.parametrize(("factor", "within"), [(1.0, 0.9545), (2.0, 0.6827)])
 def test_sigmas_that_are_right_and_half_as_large_as_they_should_be(truth: Truth, factor: float, within: float) -> None:
     grid, rng = on_grid(truth), np.random.default_rng(5)
