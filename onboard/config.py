@@ -33,7 +33,7 @@ class LidarConfig:
         8192, "kernel receive buffer; 8192 bridges a stall of 4 s [kB]", minimum=16, maximum=262144
     )
     poll_ms: int = option(
-        240, "longest pause between two looks at the sockets; receive times are the kernel's and do not depend on it [ms]",
+        240, "longest pause between two looks at the sockets, 100 with a downlink; receive times are the kernel's [ms]",
         minimum=1, maximum=250,
     )  # fmt: skip
     fov: FovConfig = option(FovConfig, "what is kept; the rest looks at the airframe")

@@ -44,6 +44,8 @@ from onboard.worker import Worker
 _log = logging.getLogger(__name__)
 
 _STATUS_S: Final = 1.0
+_LIVE_POLL_MS: Final = 100
+"""With somebody to watch: older packets are no live picture."""
 _END_S: Final = 60.0
 """How long a worker may take to end: a slow disk gets the time to take what is in the backlog."""
 
@@ -83,7 +85,10 @@ class Daemon:
         # The ports first: packets wait in their buffers while the log is opened.
         self._recorder: Recorder | None = None
         self._only_armed = settings.recorder.lidar == "armed"
-        self._lidar = LidarPort(settings.lidar, self._log_time, self._put, self._is_flight, self._handed_over)
+        lidar = settings.lidar
+        if settings.downlink.address is not None:
+            lidar = replace(lidar, poll_ms=min(lidar.poll_ms, _LIVE_POLL_MS))
+        self._lidar = LidarPort(lidar, self._log_time, self._put, self._is_flight, self._handed_over)
         try:
             keep_free_bytes = 2 * settings.recorder.min_free_mb << 20
             self._salvager = leftovers.begin(self._directory, keep_free_bytes, settings.recorder.compression)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from lidar_stream import Stream, from_address, packet
 
 from flightlog import records
 from flightlog.records import LidarAccount
@@ -17,7 +18,12 @@ from onboard.timesync import LogTime, read_clocks
 class Session:
     """A port and what it handed over."""
 
-    def __init__(self, fov: tuple[float, float] = (0, 0), room: Callable[[str], bool] = lambda topic: True) -> None:
+    def __init__(
+        self,
+        fov: tuple[float, float] = (0, 0),
+        room: Callable[[str], bool] = lambda topic: True,
+        poll_ms: int = 20,
+    ) -> None:
         self.messages: list[tuple[str, int, bytes]] = []
         self.room = room
         ports = []
@@ -27,10 +33,16 @@ class Session:
                 ports.append(sock.getsockname()[1])
         self.data_address, self.position_address = (("127.0.0.1", port) for port in ports)
         config = LidarConfig(
-            "127.0.0.1", ports[0], ports[1], poll_ms=20, receive_buffer_kb=1024, fov=FovConfig(fov[0], fov[1])
+            "127.0.0.1", ports[0], ports[1], poll_ms=poll_ms, receive_buffer_kb=2048, fov=FovConfig(fov[0], fov[1])
         )
+        self.handed_over_ns: list[int] = []
         self.log_time = LogTime.start(read_clocks())
-        self.port = LidarPort(config, self.log_time, self.put)
+        self.port = LidarPort(
+            config,
+            self.log_time,
+            self.put,
+            handed_over=lambda: self.handed_over_ns.append(time.monotonic_ns()),
+        )
 
     def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
         del vital
@@ -153,6 +165,42 @@ def test_a_batch_spans_about_a_tenth_of_a_second(monterey_data: list[bytes]) -> 
     scans = [records.receive_time_ns(records.decode_scan(data)) for _, data in session.of(records.LIDAR.topic)]
     assert 5 <= len(scans) <= 14
     assert np.median([times[-1] - times[0] for times in scans]) < 150e6
+
+
+def test_few_looks_at_the_socket_make_messages_of_a_tenth_of_a_second_each_with_its_account() -> None:
+    session = Session(poll_ms=240)
+    session.port.start()
+    with from_address("127.0.0.1") as sender:
+        stream = Stream(sender, session.data_address)
+        time.sleep(3.0)
+        stream.stop()
+    session.port.stop()
+    scans = session.of(records.LIDAR.topic)
+    assert [time_ns for time_ns, _ in scans] == [time_ns for time_ns, _ in session.of(records.LIDAR_ACCOUNT.topic)]
+    assert session.account() == LidarAccount(received=stream.sent, kept=stream.sent)
+    times = [records.receive_time_ns(records.decode_scan(data)) for _, data in scans]
+    assert (np.diff(np.concatenate(times)) >= 0).all()
+    assert 0.08e9 < np.median([span[-1] - span[0] for span in times]) < 0.16e9
+    # looks become rare when the rate is known: 12 in 3 s, and some more at the start
+    assert len(session.handed_over_ns) < 25
+
+
+def test_what_comes_after_silence_does_not_wait_for_the_next_look() -> None:
+    session = Session(poll_ms=240)
+    session.port.start()
+    time.sleep(0.6)
+    waits = []
+    with from_address("127.0.0.1") as sender:
+        for number in range(5):
+            before_ns, known = time.monotonic_ns(), len(session.messages)
+            sender.sendto(packet(number), session.data_address)
+            while len(session.messages) == known:
+                assert time.monotonic_ns() - before_ns < 5e9
+                time.sleep(0.002)
+            waits.append(time.monotonic_ns() - before_ns)
+            time.sleep(0.6)
+    session.port.stop()
+    assert np.median(waits) < 0.12e9
 
 
 @pytest.mark.parametrize("which", ["data_address", "position_address"])
