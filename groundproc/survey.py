@@ -24,7 +24,8 @@ class Survey:
         "for height: ellipsoid where the autopilot does not state both heights: the geoid's height above the ellipsoid "
         "there [m], or a grid file that PROJ reads (.gtx, .tif)",
     )
-    method: str = option("ins", "how the trajectory is made", choices=("ins",))
+    method: str = option("ins", "how the trajectory is made", choices=("ins", "adjusted"))
+    causal: bool = option(False, "adjusted: use nothing of the future, as in flight")
     pose_grid_ms: float | None = option(
         None,
         "one pose for so many milliseconds, as the source did with 10; null: a pose for every firing",

@@ -209,7 +209,9 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     """Second differences of position over two slices against the force between: hat(t) (R f + g) integrated, free of velocities."""
     mats = frames.mat_from_quat(path.quat)
     middle = 0.5 * (mats[:-1] + mats[1:])
-    force = unit.force_m_s2 - unit.values["accel_bias"]
+    force = (unit.force_m_s2 - unit.values["accel_bias"]) @ frames.mat_from_quat(
+        frames.quat_exp(unit.values["turn"][None])
+    )[0].T
     felt = np.einsum("nij,nj->ni", middle, force).reshape(-1, STEPS, 3)
     rising, falling = _HAT[:STEPS], _HAT[STEPS:]
     up, down = np.einsum("k,nkj->nj", rising, felt), np.einsum("k,nkj->nj", falling, felt)
@@ -234,6 +236,8 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     builder.at_knots(row, knot + 1, 3, unit_mat)
     builder.at_knots(row, knot, 0, mean_mat @ cross(mean_force))
     builder.by(row, f"{unit.name}.accel_bias", mean_mat)
+    if f"{unit.name}.turn" in unknowns.names:
+        builder.by(row, f"{unit.name}.turn", mean_mat @ cross(mean_force))
     builder.by(row, "world.turn", np.tile(-cross(GRAVITY[None])[0], (len(good), 1, 1)))
     if f"{unit.name}.lever" in unknowns.names:
         at = mats[::STEPS]

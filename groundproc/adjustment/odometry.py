@@ -65,12 +65,12 @@ class Step:
         Of the slice.
     quat, position_m : ndarray, shape (4,), (3,)
         At its end, corrected.
-    predicted_quat, predicted_position_m
-        The same before the correction.
     gyro_bias_rad_s : ndarray, shape (3,)
     sigma : ndarray, shape (6,)
         Of attitude [rad] and position [m].
     clusters : ndarray of CLUSTER_DTYPE
+    world_m : ndarray, shape (m, 3)
+        Where the corrected pose places them.
     matched : int
         Clusters that found a plane.
     residual_m : float
@@ -84,6 +84,7 @@ class Step:
     gyro_bias_rad_s: Array
     sigma: Array
     clusters: npt.NDArray[np.void]
+    world_m: Array
     matched: int
     residual_m: float
 
@@ -160,7 +161,7 @@ class Odometry:
             self.map.forget_beyond(s.position_m, self.REACH_M)
         return Step(
             piece.number, s.quat.copy(), s.position_m.copy(), s.velocity_m_s.copy(), s.gyro_bias_rad_s.copy(),
-            np.sqrt(np.diag(s.covariance)[:6]), clusters, matched, residual,
+            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, matched, residual,
         )  # fmt: skip
 
     def position_fix(self, position_m: Array, sigma_m: Array) -> None:
@@ -230,7 +231,7 @@ def _propagate(
             position[i] += dt * velocity[i] + 0.5 * dt * dt * a
             velocity[i] += dt * a
         quat_turned(quat, dt * wx, dt * wy, dt * wz, quat)
-        covariance = change @ covariance @ change.T
+        covariance = change @ covariance @ np.ascontiguousarray(change.T)
         for i in range(STATES):
             covariance[i, i] += noise[i]
         quats[k + 1], positions[k + 1] = quat, position

@@ -126,6 +126,14 @@ class Rows:
         )
         return np.asarray(out.sum(axis=0))
 
+    def noise(self, rng: np.random.Generator) -> Array:
+        """A draw of what the noise of the rows does to the gradient: its covariance is the normal matrix."""
+        out = np.zeros((PARTS, (self.intervals + 3) * 6))
+        with np.errstate(divide="ignore"):
+            drawn = np.where(self.weight > 0, rng.standard_normal(len(self)) / np.sqrt(self.weight), 0.0)
+        _gradient(self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.inverse, drawn, out)
+        return np.asarray(out.sum(axis=0))
+
     def blocks(self) -> Array:
         """Information on the pose of each interval were the planes known, shape (intervals, 6, 6)."""
         out = np.zeros((self.intervals, 6, 6))
@@ -156,12 +164,7 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
         Whether rows beyond `CUT` sigmas are dropped: not while the path is still rough.
     """
     count = len(clusters)
-    world, body, knot, weights = (
-        np.empty((count, 3)),
-        np.empty((count, 3), np.float32),
-        np.empty(count, np.int32),
-        np.empty((count, 4), np.float32),
-    )
+    world, knot, weights = np.empty((count, 3)), np.empty(count, np.int32), np.empty((count, 4), np.float32)
     rotation = np.empty((count, 9), np.float32)
     _place(clusters.time_ns, clusters.xyz_m, path.start_ns, path.quat, path.position_m, world, rotation, knot, weights)
     voxel, voxels = _assign(world, voxel_m, np.full(1 << int(np.ceil(np.log2(max(4 * count, 1 << 12)))), -1, np.int32))
@@ -181,7 +184,6 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
         starts, kept, world, rotation, clusters.xyz_m, clusters.scatter_m2, clusters.count, normals[ids], means[ids], voxel_m, cut, jacobian, plane, weight,
         residual, inverse,
     )  # fmt: skip
-    del body
     return Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
 
 
@@ -339,8 +341,8 @@ def _choose(first: Any, order: Any, knot: Any, normals: Any, flat: Any, interval
         start = count
         for at in range(first[v], first[v + 1]):
             p = share[knot[order[at]], kind[v]]
-            # a draw that is the same in every run: by the cluster's number
-            if p >= 1.0 or (spread(order[at] * 2654435761) & 0xFFFFF) < p * 0x100000:
+            # a draw by voxel, the same in every run, so that the voxels kept are seen by many slices
+            if p >= 1.0 or (spread(v * 2654435761) & 0xFFFFF) < p * 0x100000:
                 keep[count] = at
                 count += 1
         if count - start < 2:

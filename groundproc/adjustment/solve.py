@@ -16,8 +16,8 @@ Array = npt.NDArray[np.float64]
 
 SHARE: Final = 0.15
 """Part of the lidar's information that is left when the planes are unknowns too, roughly: it makes the preconditioner."""
-MOST_STEPS: Final = int(__import__("os").environ.get("MS", "60"))
-ENOUGH: Final = float(__import__("os").environ.get("EN", "3e-4"))
+MOST_STEPS: Final = 80
+ENOUGH: Final = 1e-4
 """The iteration ends where a step lowers the cost by less than this share of all steps so far."""
 
 
@@ -49,7 +49,7 @@ class Problem:
         out[:size] += self.rows.apply(vector[:size]) / self.deflation
         return np.asarray(out)
 
-    def solve(self, right: Array) -> tuple[Array, int]:
+    def solve(self, right: Array, enough: float = ENOUGH) -> tuple[Array, int]:
         """Normal matrix x = right, by preconditioned conjugate gradients; and the steps it took."""
         x, r = np.zeros_like(right), right.copy()
         z = self.factor.solve(r)  # type: ignore[attr-defined]
@@ -61,7 +61,7 @@ class Problem:
             x += alpha * p
             r -= alpha * image
             gained += alpha * rz
-            if alpha * rz < ENOUGH * gained:
+            if alpha * rz < enough * gained:
                 return x, step
             z = self.factor.solve(r)  # type: ignore[attr-defined]
             before, rz = rz, float(r @ z)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the products")
     parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
-    parser.add_argument("--method", choices=("ins",), help="how the trajectory is made")
+    parser.add_argument("--method", choices=("ins", "adjusted"), help="how the trajectory is made")
+    parser.add_argument(
+        "--causal", action="store_true", default=None, help="adjusted: use nothing of the future, as in flight"
+    )
     parser.add_argument(
         "--crs",
         "--epsg",
@@ -46,7 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.progress import stages
 
     survey = _survey(arguments)
-    with stages(arguments.logs, {"read": "clocks and autopilot", "place": "points"}) as progress:
+    with stages(
+        arguments.logs, {"read": "clocks and autopilot", "adjust": "trajectory", "place": "points"}
+    ) as progress:
         quality = process(arguments.logs, survey, arguments.output, progress, arguments.trajectory)
     if arguments.json:
         import json
@@ -54,6 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(quality, indent=2))
     else:
         print(_report(quality, arguments.output))
+    if quality["trajectory"]["warning"]:
+        print(f"swath: {quality['trajectory']['warning']}", file=sys.stderr)
+        return 1
     return 0
 
 
@@ -69,6 +78,7 @@ def _survey(arguments: argparse.Namespace) -> Survey:
     given = {
         "crs": arguments.crs,
         "method": arguments.method,
+        "causal": arguments.causal,
         "height": arguments.height,
         "geoid": arguments.geoid,
         "sync": arguments.sync,

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 
 from flightlog.errors import LogError
+from groundproc.adjustment import adjusted
 from groundproc.trajectory import ins
 from groundproc.trajectory.method import Estimate, Given, Progress
 from groundproc.trajectory.trajectory import Trajectory, joined
@@ -47,4 +48,12 @@ def ins_estimate(given: Given, progress: Progress) -> Estimate:
     return Estimate(joined(parts), given.mount, ins.SIGMA_SOURCE)
 
 
-METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {"ins": ins_estimate}
+def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
+    """Lidar, inertial sensors, GNSS and compass in one adjustment, begun from the autopilot's solution."""
+    return adjusted.estimate(given, progress, ins_estimate(given, progress).trajectory)
+
+
+METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
+    "ins": ins_estimate,
+    "adjusted": adjusted_estimate,
+}

@@ -1,0 +1,241 @@
+"""The batch: Gauss-Newton over a stretch of the flight, coarse voxels first, with all that is common to it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from groundproc.adjustment.anchors import COMPASS_TERMS, Attitudes, Positions, attitude_factor, position_factor
+from groundproc.adjustment.factors import (
+    H,
+    Factor,
+    Unit,
+    Unknowns,
+    force_factor,
+    prior_factor,
+    robust_sigma,
+    turn_factor,
+)
+from groundproc.adjustment.motion import ImuTrack, on_grid
+from groundproc.adjustment.planes import Clusters, rows_of
+from groundproc.adjustment.scans import STEPS
+from groundproc.adjustment.solve import Problem, problem
+from groundproc.adjustment.spline import Path
+
+Array = npt.NDArray[np.float64]
+
+ROUNDS: Final = ((1.0, False), (0.5, False), (0.5, True), (0.5, True))
+"""Edge of the voxels [m], and whether outliers are cut, of each Gauss-Newton step."""
+DEFLATION: Final = 4.0
+"""The lidar's information is divided by this: errors of neighbouring clusters are not independent. Checked by the share of errors within
+two sigmas (tests)."""
+DRAWS: Final = 12
+"""Draws from the posterior that the sigmas are from: right to a fifth."""
+
+PRIORS: Final[dict[str, float]] = {
+    "lidar.bias": np.deg2rad(50.0), "lidar.scale": 0.01, "lidar.turn": np.deg2rad(0.3), "lidar.accel_bias": 0.5,
+    "lidar.lever": 0.15,
+    "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5, "ins.lever": 0.05,
+    "ins.delay": 0.01,
+}  # fmt: skip
+"""What is known before, one sigma: gyro bias [rad/s], scale, misalignment against the lidar's optics [rad], accelerometer bias [m/s^2], place
+against the nominal one [m], delay beyond the synchronisation's [s]."""
+COMPASS_PRIOR: Final = np.deg2rad([5.0, 10.0, 10.0, 4.0, 4.0])
+
+
+@dataclass(slots=True)
+class Batch:
+    """A stretch of flight under adjustment.
+
+    Attributes
+    ----------
+    path : Path
+    clusters : Clusters
+    units : list of Unit
+        The one that carries the motion between knots first.
+    tracks : dict of str to ImuTrack
+        What the units were made of.
+    positions, attitudes
+    mat_sensor_ins : ndarray, shape (3, 3)
+        Nominal.
+    lever_ins_m : ndarray, shape (3,)
+        Nominal place of the ins origin in the sensor frame.
+    compass : ndarray, shape (5,)
+    most : int
+        Rows of a slice.
+    """
+
+    path: Path
+    clusters: Clusters
+    units: list[Unit]
+    tracks: dict[str, ImuTrack]
+    positions: Sequence[Positions]
+    attitudes: Sequence[Attitudes]
+    mat_sensor_ins: Array
+    lever_ins_m: Array
+    compass: Array = field(default_factory=lambda: np.zeros(COMPASS_TERMS))
+    most: int = 1000
+    log: list[dict[str, float]] = field(default_factory=list)
+
+    def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
+        """All Gauss-Newton steps, and the posterior of the last."""
+        last: Posterior | None = None
+        for number, (voxel_m, cut) in enumerate(rounds):
+            last = self.step(voxel_m, cut, weigh=number == 1)
+        assert last is not None
+        return last
+
+    def unknowns(self) -> Unknowns:
+        """The unknowns that this flight's instruments have."""
+        unknowns = Unknowns(self.path.intervals)
+        unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]))
+        unknowns.add("world.shift", np.full(3, 100.0))
+        for unit in self.units:
+            names = ["bias", "scale", "turn"]
+            if unit.force_known.any():
+                names += ["accel_bias", "lever"]
+            if unit.name == "ins":
+                names.append("delay")
+            for name in names:
+                key = f"{unit.name}.{name}"
+                unknowns.add(key, np.full(1 if name == "delay" else 3, PRIORS[key]))
+        unknowns.add("compass", COMPASS_PRIOR)
+        return unknowns
+
+    def step(self, voxel_m: float, cut: bool, weigh: bool) -> "Posterior":
+        """One Gauss-Newton step; `weigh`: set the noise of the inertial units by their residuals first.
+
+        That is done once, after the first step: done again and again, the path would follow the units and their noise seem to vanish.
+        """
+        unknowns = self.unknowns()
+        rows = rows_of(self.clusters, self.path, voxel_m, self.most, cut)
+        factors = self.factors(unknowns, weigh)
+        linear = problem(rows, factors, unknowns, DEFLATION)
+        x, steps = linear.solve(-linear.gradient)
+        cost, used = rows.cost()
+        self.log.append(
+            {
+                "voxel_m": voxel_m, "rows": len(rows), "used": used, "steps": steps, "chi_square": cost / max(used, 1),
+                "moved_m": float(np.sqrt(np.mean(np.square(x[: unknowns.path_size].reshape(-1, 6)[:, 3:])) * 3.0)),
+            }
+            | {f"{f.name}_rms": f.rms() for f in factors}
+        )  # fmt: skip
+        self.take(unknowns, x)
+        return Posterior(linear, unknowns, factors)
+
+    def factors(self, unknowns: Unknowns, weigh: bool) -> list[Factor]:
+        """Everything but the lidar."""
+        found: list[Factor] = []
+        values: dict[str, Array] = {"compass": self.compass}
+        for unit in self.units:
+            turn = turn_factor(unit, self.path, unknowns)
+            if weigh:
+                unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), 1e-6)
+                turn.sigma[:] = unit.sigma_turn_rad
+            found.append(turn)
+            if unit.force_known.any():
+                force = force_factor(unit, self.path, unknowns)
+                if weigh:
+                    unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), 1e-4)
+                    force.sigma[:] = unit.sigma_force_m_s2
+                found.append(force)
+            values |= {f"{unit.name}.{name}": value for name, value in unit.values.items()}
+        if "ins.lever" in values:
+            values["ins.lever"] = values["ins.lever"] - self.lever_ins_m
+        ins = next((unit for unit in self.units if unit.name == "ins"), None)
+        mat = self.mat_sensor_ins if ins is None else turned(ins.values["turn"]) @ self.mat_sensor_ins
+        for positions in self.positions:
+            factor = position_factor(positions, self.path, unknowns)
+            if factor is not None:
+                found.append(factor)
+        for attitudes in self.attitudes:
+            factor = attitude_factor(
+                attitudes, self.path, unknowns, mat, self.compass, None if ins is None else "ins.turn"
+            )
+            if factor is not None:
+                found.append(factor)
+        found.append(prior_factor(unknowns, values))
+        return found
+
+    def take(self, unknowns: Unknowns, x: Array) -> None:
+        """Put a solution in."""
+        part = {name: x[place] for name, place in unknowns.names.items()}
+        path = self.path.corrected(x[: unknowns.path_size].reshape(-1, 6))
+        self.path = path.turned(turned(part["world.turn"]), part["world.shift"])
+        self.compass = self.compass + part["compass"]
+        for unit in self.units:
+            for name in unit.values:
+                change = part.get(f"{unit.name}.{name}")
+                if change is None:
+                    continue
+                if name == "turn":
+                    mat = turned(change) @ turned(unit.values["turn"])
+                    unit.values["turn"] = frames.quat_log(frames.quat_from_mat(mat[None]))[0]
+                else:
+                    unit.values[name] = unit.values[name] + change
+            if f"{unit.name}.delay" in part:
+                place_on_grid(unit, self.tracks[unit.name], self.path)
+
+
+@dataclass(slots=True)
+class Posterior:
+    """The last step's linear problem: covariances come from it."""
+
+    problem: Problem
+    unknowns: Unknowns
+    factors: list[Factor]
+
+    def draws(self, count: int, seed: int = 1) -> Array:
+        """Draws from the posterior about the solution, shape (count, unknowns): noise put through the same solution."""
+        rng = np.random.default_rng(seed)
+        found = np.empty((count, self.unknowns.size))
+        for i in range(count):
+            right = np.zeros(self.unknowns.size)
+            right[: self.unknowns.path_size] = self.problem.rows.noise(rng) / np.sqrt(DEFLATION)
+            for factor in self.factors:
+                right += factor.matrix.T @ (rng.standard_normal(len(factor.sigma)) / factor.sigma)
+            found[i], _ = self.problem.solve(right, 1e-2)
+        return found
+
+    def covariance(self, names: Sequence[str]) -> Array:
+        """Covariance of some globals, exactly, shape (m, m): the inverse's columns."""
+        places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
+        columns = np.empty((len(places), len(places)))
+        for i, place in enumerate(places):
+            right = np.zeros(self.unknowns.size)
+            right[place] = 1.0
+            columns[i] = self.problem.solve(right, 1e-5)[0][places]
+        return np.asarray(0.5 * (columns + columns.T))
+
+
+def turned(vector: Array) -> Array:
+    """Matrix of a rotation vector, shape (3, 3)."""
+    return np.asarray(frames.mat_from_quat(frames.quat_exp(vector[None]))[0])
+
+
+def place_on_grid(unit: Unit, track: ImuTrack, path: Path) -> None:
+    """Rates and forces of a unit on the path's grid, with its delay taken off the stamps."""
+    steps = path.intervals * STEPS
+    time_ns = track.time_ns - round(float(unit.values["delay"][0]) * 1e9)
+    unit.rate_rad_s, unit.known = on_grid(time_ns, track.rate_rad_s, path.start_ns, steps)
+    unit.force_m_s2, unit.force_known = on_grid(time_ns, np.nan_to_num(track.force_m_s2), path.start_ns, steps)
+    if not np.isfinite(track.force_m_s2).all():
+        unit.force_known[:] = False
+
+
+def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array) -> Unit:
+    """A unit with nothing estimated yet but its gyro's bias."""
+    values = {
+        "bias": bias.copy(), "scale": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1), "accel_bias": np.zeros(3),
+        "lever": lever.copy(),
+    }  # fmt: skip
+    none = np.zeros((0, 3))
+    unit = Unit(
+        name, none, none, np.zeros(0, np.bool_), np.zeros(0, np.bool_), values, track.rate_density() * np.sqrt(H),
+        track.force_density() * np.sqrt(2.0 / 3.0 / H),
+    )  # fmt: skip
+    place_on_grid(unit, track, path)
+    return unit
