@@ -219,6 +219,14 @@ class MountOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class MovingOptions:
+    """What moves in the scene, on ways of its own."""
+
+    cars: int = option(0, "cars that drive at 6 to 9 m/s", minimum=0, maximum=200)
+    people: int = option(0, "people who walk at 1.1 to 1.6 m/s", minimum=0, maximum=200)
+
+
+@dataclass(frozen=True, slots=True)
 class FaultOptions:
     """What goes wrong in flight; a time of 0 s: it does not."""
 
@@ -249,6 +257,7 @@ class Options:
     ins: InsOptions = option(InsOptions, "errors of the autopilot's estimates")
     link: LinkOptions = option(LinkOptions, "MAVLink link")
     mount: MountOptions = option(MountOptions, "true mount against nominal")
+    moving: MovingOptions = option(MovingOptions, "what moves in the scene")
     faults: FaultOptions = option(FaultOptions, "what goes wrong")
     truth_hz: float = option(500.0, "rate of truth.csv [Hz]", minimum=100, maximum=2000)
     capture_resolution: str = option("us", "resolution of the pcap's stamps", choices=("us", "ns"))

@@ -104,6 +104,13 @@ def _meet(
     return (plane[3] - away) / slope, abs(slope)
 
 
+@nb.njit(cache=True, nogil=True, inline="always")
+def _plane(planes: npt.NDArray[np.float64], moved: npt.NDArray[np.float64], index: int) -> npt.NDArray[np.float64]:
+    """Plane of what a ray met: that of a triangle, or of something that moves."""
+    met: npt.NDArray[np.float64] = planes[index] if index < len(planes) else moved[index - len(planes)]
+    return met
+
+
 @nb.njit(cache=True, nogil=True)
 def form(
     origins: npt.NDArray[np.float32],
@@ -117,6 +124,8 @@ def form(
     flicker: npt.NDArray[np.float64],
     threshold: float,
     max_range_m: float,
+    moved: npt.NDArray[np.float64],
+    moved_material: npt.NDArray[np.uint8],
 ) -> npt.NDArray[np.float64]:
     """The strongest, the second strongest and the last echo of each shot, shape (shots, 3, 4): see STRONGEST and RANGE.
 
@@ -124,7 +133,7 @@ def form(
     ----------
     origins, directions : shape (shots * rays, 3)
     opaque, clear : shape (shots * rays,)
-        Triangle that each ray meets, -1 for none; a pane counts where it is nearer.
+        Triangle that each ray meets, -1 for none; a pane counts where it is nearer. What moves counts on from the triangles.
     planes : shape (triangles, 4)
     material : shape (triangles,)
     tables : shape (3, materials)
@@ -133,6 +142,9 @@ def form(
         Factor on the strength of a shot's first echo and of the others.
     threshold : float
         Least detectable strength divided by the squared range [1/m^2].
+    max_range_m : float
+    moved, moved_material : shape (k, 4), (k,)
+        Planes and materials of what moves, each row at the instant of its ray.
     """
     shots = len(flicker)
     echoes = np.zeros((shots, 3, 4))
@@ -144,7 +156,7 @@ def form(
             light = 1.0 / rays
             hit_m, cosine = -1.0, 0.0
             if opaque[ray] >= 0:
-                hit_m, cosine = _meet(origins[ray], directions[ray], planes[opaque[ray]])
+                hit_m, cosine = _meet(origins[ray], directions[ray], _plane(planes, moved, opaque[ray]))
             if clear[ray] >= 0:
                 pane_m, pane_cosine = _meet(origins[ray], directions[ray], planes[clear[ray]])
                 if 0.0 < pane_m <= max_range_m and (opaque[ray] < 0 or pane_m < hit_m):
@@ -155,13 +167,14 @@ def form(
                     count += 1
                     light *= tables[2, kind] ** 2
             if 0.0 < hit_m <= max_range_m:
-                kind = material[opaque[ray]]
+                hit = opaque[ray]
+                kind = material[hit] if hit < len(material) else moved_material[hit - len(material)]
                 met[count, 0] = hit_m
                 met[count, 1] = light * tables[0, kind] * cosine ** tables[1, kind]
                 who[count, 0], who[count, 1] = opaque[ray], ray
                 count += 1
         if count:
-            _cluster(echoes[shot], met, who, count, planes, origins, directions, flicker[shot], threshold)
+            _cluster(echoes[shot], met, who, count, planes, moved, origins, directions, flicker[shot], threshold)
     return echoes
 
 
@@ -187,6 +200,7 @@ def _cluster(
     who: npt.NDArray[np.int32],
     count: int,
     planes: npt.NDArray[np.float64],
+    moved: npt.NDArray[np.float64],
     origins: npt.NDArray[np.float32],
     directions: npt.NDArray[np.float32],
     flicker: npt.NDArray[np.float64],
@@ -206,8 +220,9 @@ def _cluster(
                 most = end
             end += 1
         mixed = 0.0
+        plane = _plane(planes, moved, who[most, 0])
         for i in range(start, end):
-            expected_m, _ = _meet(origins[who[i, 1]], directions[who[i, 1]], planes[who[most, 0]])
+            expected_m, _ = _meet(origins[who[i, 1]], directions[who[i, 1]], plane)
             if abs(expected_m - met[i, 0]) > _OFF_PLANE_M:
                 mixed = 1.0
         seen = total * flicker[0 if start == 0 else 1]

@@ -4,11 +4,12 @@ import numpy as np
 
 from simulator.buildings import add_house, add_tree
 from simulator.meshes import box, prism, quad
+from simulator.moving import Tracks, over_ground
 from simulator.parts import Parts, World
 from simulator.route import Route
 
 
-def lake(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
+def lake(rng: np.random.Generator) -> tuple[World, dict[str, Route], Tracks]:
     """Water to the horizon, a shore in the south with trees, a boathouse and a jetty; flown out of sight of land, or out and back."""
     parts = Parts()
     far_m = 500.0
@@ -34,7 +35,9 @@ def lake(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
         (20.0, 170.0, float(height[1])),
         (-20.0, 170.0, float(height[2])),
     )
-    return parts.world(), {
+    walk = over_ground([(-40.0, -3.0), (40.0, -3.0), (40.0, -4.0), (-40.0, -4.0)], lambda x, _: np.full_like(x, 0.8))
+    routes = {
         "open": Route(points_m=around, speed_m_s=5.0),
         "out": Route(points_m=(*out, (-20.0, 25.0, float(height[3]))), speed_m_s=7.0, loop_from=0),
     }
+    return parts.world(), routes, Tracks(people=(walk,))

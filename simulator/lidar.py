@@ -31,6 +31,7 @@ from simulator.config import LidarOptions
 from simulator.echoes import LAST, MIXED, RANGE, RAYS, SECOND, STRENGTH, STRONGEST, TRIANGLE, aim, form
 from simulator.flight import Flight
 from simulator.materials import FALLOFF, REFLECTANCE, TRANSMISSION
+from simulator.moving import Traffic
 from simulator.parts import World
 from simulator.rays import Surfaces
 
@@ -56,7 +57,12 @@ TRUTH_DTYPE: Final = np.dtype(
     ]
 )
 """A true echo: the shot's time on the lidar's clock (unwrapped), the point in the local frame and its range before any noise, the
-surface it lies on, the laser, 0 for the strongest or only return and 1 for the other one of a pair, mixed or not."""
+surface it lies on, the triangle (-1 on what moves), the laser, 0 for the strongest or only return and 1 for the other one of a pair,
+mixed or not."""
+
+
+_Moved = tuple[Array, npt.NDArray[np.int32]]
+"""Planes of moving faces that rays met, and the box of each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +113,21 @@ class Lidar:
         `mount` is the true one; `clock` the lidar's own.
     options : LidarOptions
     seed : int
+    traffic : Traffic, optional
+        What moves in the world.
     """
 
     def __init__(
-        self, world: World, flight: Flight, mount: Mount, clock: Clock, options: LidarOptions, seed: int
+        self,
+        world: World,
+        flight: Flight,
+        mount: Mount,
+        clock: Clock,
+        options: LidarOptions,
+        seed: int,
+        traffic: Traffic | None = None,
     ) -> None:
+        self._traffic = traffic if traffic is not None and len(traffic) else None
         self._world, self._flight, self._options, self._seed, self._clock = world, flight, options, seed, clock
         self._surfaces = Surfaces(world)
         self._lever_m, self._mat_ins_lidar = mount.lidar_position_m(), mount.mat_ins_lidar()
@@ -152,11 +168,11 @@ class Lidar:
         open_shots = airframe_m == 0.0
         if self._options.dark:
             open_shots[:] = False
-        origins, directions, echoes = self._cast(time_s, turn_deg, open_shots, rng, int(firing[0]) * LASERS)
+        origins, directions, echoes, moved = self._cast(time_s, turn_deg, open_shots, rng, int(firing[0]) * LASERS)
         ranges, strengths = self._returns(echoes, open_shots, airframe_m, rng)
         packets = self._pack(first_packet, count, turn_deg[:-1], ranges, strengths, rng)
         sent_s = time_s[self._firings :: self._firings]
-        truth = self._truth(echoes, open_shots, origins, directions, self._clock.start_ns + elapsed_ns)
+        truth = self._truth(echoes, open_shots, origins, directions, self._clock.start_ns + elapsed_ns, moved)
         return Sweep(packets, sent_s, truth)
 
     def _cast(
@@ -166,11 +182,12 @@ class Lidar:
         open_shots: npt.NDArray[np.bool_],
         rng: np.random.Generator,
         first_shot: int,
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], Array]:
-        """Origin and direction of the middle of each open shot's beam, and their echoes (shots, 3, 4)."""
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], Array, _Moved]:
+        """Origin and direction of the middle of each open shot's beam, their echoes (shots, 3, 4), and what of them moves."""
+        moved: _Moved = np.zeros((0, 4)), np.zeros(0, np.int32)
         if not open_shots.any():
             none = np.zeros((0, 3), np.float32)
-            return none, none, np.zeros((0, 3, 4))
+            return none, none, np.zeros((0, 3, 4)), moved
         poses = self._flight.poses(time_s)
         mat = poses.mat_local_ins()
         rays = RAYS if self._options.footprint_mrad > 0 else 1
@@ -188,10 +205,15 @@ class Lidar:
         flicker = np.clip(
             1.0 + self._options.intensity_noise * rng.standard_normal((len(origins) // rays, 2)), 0.05, None
         )
+        opaque, materials = self._surfaces.opaque(origins, directions), np.zeros(0, np.uint8)
+        if self._traffic is not None:
+            firing, reach_m = np.nonzero(open_shots)[0], self._options.max_range_m
+            moved = self._traffic.meet(time_s, firing, origins, directions, opaque, self._surfaces.planes, reach_m)
+            materials = self._traffic.material[moved[1]]
         echoes = form(
             origins,
             directions,
-            self._surfaces.opaque(origins, directions),
+            opaque,
             self._surfaces.clear(origins, directions),
             self._surfaces.planes,
             self._world.material,
@@ -200,8 +222,10 @@ class Lidar:
             flicker,
             self._threshold,
             self._options.max_range_m,
+            moved[0],
+            materials,
         )
-        return origins[::rays], directions[::rays], echoes
+        return origins[::rays], directions[::rays], echoes, moved
 
     def _airframe(self, turn_deg: Array, step_deg: float) -> Array:
         """Airframe ranges of all shots [m], 0 where the view is free, shape (n, 32)."""
@@ -265,6 +289,7 @@ class Lidar:
         origins: npt.NDArray[np.float32],
         directions: npt.NDArray[np.float32],
         firing_ns: npt.NDArray[np.int64],
+        moved: _Moved,
     ) -> npt.NDArray[np.void]:
         firing, laser = np.nonzero(open_shots)
         order = {ReturnMode.LAST: [LAST], ReturnMode.DUAL: [STRONGEST, LAST]}.get(self._mode, [STRONGEST])
@@ -283,9 +308,21 @@ class Lidar:
             truth["lidar_ns"] = firing_ns[firing[kept]] + laser[kept] * LASER_NS
             truth["range_m"], truth["mixed"] = echo[kept, RANGE], echo[kept, MIXED] > 0
             truth["triangle"] = echo[kept, TRIANGLE]
-            truth["normal"] = self._surfaces.planes[truth["triangle"], :3]
-            truth["surface"] = self._world.surface[truth["triangle"]]
+            self._name(truth, moved)
             truth["laser"], truth["number"] = laser[kept], number
             parts.append(truth)
         merged = np.concatenate(parts)
         return merged[np.argsort(merged["lidar_ns"], kind="stable")]
+
+    def _name(self, truth: npt.NDArray[np.void], moved: _Moved) -> None:
+        """Fill in normal and surface by the triangle; what moves has none, and its surface counts on from the world's."""
+        planes, box = moved
+        triangles = len(self._surfaces.planes)
+        away = np.flatnonzero(truth["triangle"] >= triangles)
+        row = truth["triangle"][away] - triangles
+        truth["triangle"][away] = -1
+        truth["normal"] = self._surfaces.planes[truth["triangle"], :3]
+        truth["surface"] = self._world.surface[truth["triangle"]]
+        if self._traffic is not None and len(away):
+            truth["normal"][away] = planes[row, :3]
+            truth["surface"][away] = len(self._world.names) + self._traffic.owner[box[row]]

@@ -32,6 +32,7 @@ from simulator.flight import Flight
 from simulator.geodesy import Origin
 from simulator.ins import Ins
 from simulator.lidar import Lidar, Sweep
+from simulator.moving import Traffic
 from simulator.scene import Scene, scene
 from simulator.telemetry import Telemetry
 from simulator.truth import COLUMNS, PointsWriter, write_json, write_poses
@@ -104,7 +105,10 @@ class Simulation:
         self.nominal_mount = logged_mount(self.scene.mount, options)
         self.mount = true_mount(self.nominal_mount, options, seed)
         self.ins = Ins(self.flight, options.ins, seed, self.mount.gps_position_m, Outage.of(options.faults))
-        self.lidar = Lidar(self.scene.world, self.flight, self.mount, self.clocks.lidar, options.lidar, seed)
+        self.traffic = Traffic(self.scene.tracks, options.moving, seed)
+        self.lidar = Lidar(
+            self.scene.world, self.flight, self.mount, self.clocks.lidar, options.lidar, seed, self.traffic
+        )
         self.telemetry = Telemetry(self.flight, self.mount, self.clocks, options, self.origin, seed)
         self.autopilot = Autopilot(self.ins, self.clocks, options, self.origin, seed)
 
@@ -167,7 +171,7 @@ class Simulation:
             "compass_phase_rad": self.ins.compass_phase_rad.tolist(),
             "mavlink_hz": link,
             "local_origin": dataclasses.asdict(self.origin),
-            "surfaces": list(self.scene.world.names),
+            "surfaces": [*self.scene.world.names, *self.traffic.names],
             "options": to_mapping(job.options),
         }
 

@@ -22,21 +22,25 @@ from simulator.chance import generator
 from simulator.ground import add_ground, ground_height
 from simulator.lake import lake
 from simulator.meshes import box, catenary, prism, quad
+from simulator.moving import Tracks, flat, over_ground
 from simulator.parts import Parts, World
 from simulator.route import Route, eights
 from simulator.town import town
 
 Array = npt.NDArray[np.float64]
+Place = tuple[World, dict[str, Route], Tracks]
+"""What a scene's function builds: the first of its routes is flown where none is named."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A world, a route through it, and the nominal mount."""
+    """A world, a route through it, the nominal mount, and ways for what moves."""
 
     name: str
     world: World
     route: Route
     mount: Mount = field(default_factory=Mount)
+    tracks: Tracks = field(default_factory=Tracks)
 
 
 def _on_ground(x_m: float, y_m: float) -> Array:
@@ -61,7 +65,7 @@ def _add_reference_panels(parts: Parts) -> None:
         add_panel(parts, f"{material} upright", material, np.array([30.0 + 2.0 * i, 16.0, 0.9]), 200.0)
 
 
-def village(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
+def village(rng: np.random.Generator) -> Place:
     """A long house with recessed windows, garage, shed, bicycle shelter, trees, poles, wires, cars, on undulating ground."""
     parts = Parts()
     add_ground(parts, 90.0, 0.5, rng)
@@ -103,10 +107,20 @@ def village(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     eight = eights((-15.0, 0.0), (15.0, 0.0), 12.0, (11.5, 14.0))
     mirrored = tuple((x, -y, z) for x, y, z in eight)
     both_ways = Route(points_m=((0.0, 0.0, 12.0), *eight, *mirrored), speed_m_s=6.0, smooth_s=0.7)
-    return parts.world(), {"round": route, "eights": both_ways}
+    street = [(-85.0, -20.8), (85.0, -20.8), (85.0, -18.9), (-85.0, -18.9)]
+    walks = (
+        [(-23.5, -10.2), (23.5, -10.2), (24.0, 9.8), (-23.5, 9.8)],
+        [(-60.0, -25.4), (60.0, -25.4), (60.0, -26.4), (-60.0, -26.4)],
+        [(-22.0, 10.8), (22.0, 10.8), (22.0, 13.6), (-22.0, 13.6)],
+    )
+    tracks = Tracks(
+        cars=(over_ground(street, lambda x, _: np.full_like(x, -0.12)),),
+        people=tuple(over_ground(walk, ground_height) for walk in walks),
+    )
+    return parts.world(), {"round": route, "eights": both_ways}, tracks
 
 
-def field_scene(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
+def field_scene(rng: np.random.Generator) -> Place:
     """Flat level ground at height 0 and one plain wall that looks south: for tests of geometry. Flown in lines."""
     parts = Parts()
     parts.add("ground", "grass", quad((-400, -400, 0), (800, 0, 0), (0, 800, 0)))
@@ -115,10 +129,20 @@ def field_scene(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     lines = [(-20.0, -15.0), (20.0, -15.0), (20.0, -5.0), (-20.0, -5.0), (-20.0, 5.0), (20.0, 5.0)]
     points = [(x, y, 10.0 + rng.uniform(-1, 1)) for x, y in lines]
     hover = Route(points_m=((0.0, -250.0, 10.0),), heading_deg=180.0)  # the wall is out of reach
-    return parts.world(), {"lines": Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0), "hover": hover}
+    lines_route = Route(points_m=((-24.0, -15.0, 6.0), *points), speed_m_s=4.0)
+    cars = (
+        [(-30.0, 8.0), (30.0, 8.0), (30.0, 13.0), (-30.0, 13.0)],
+        [(-30, -270), (30, -270), (30, -275), (-30, -275)],
+    )
+    walks = (
+        [(-15.0, 15.0), (15.0, 15.0), (15.0, 18.0), (-15.0, 18.0)],
+        [(-12, -262), (12, -262), (12, -266), (-12, -266)],
+    )
+    tracks = Tracks(tuple(over_ground(c, flat) for c in cars), tuple(over_ground(w, flat) for w in walks))
+    return parts.world(), {"lines": lines_route, "hover": hover}, tracks
 
 
-def facade(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
+def facade(rng: np.random.Generator) -> Place:
     """A street between long facades at 30 m, driven by a car at 6 m/s."""
     parts = Parts()
     parts.add("street", "asphalt", quad((-250, -12, 0), (500, 0, 0), (0, 20, 0)))
@@ -136,10 +160,16 @@ def facade(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
         parts.add("lamps", "metal", prism(at, at + np.array([0, 0, 6.0]), 0.06, 8))
     points = ((-150.0, 0.0, 2.1), (150.0, 0.0, 2.1), (158.0, -4.0, 2.1), (150.0, -8.0, 2.1), (-150.0, -8.0, 2.1))
     route = Route(points_m=(*points, (-158.0, -4.0, 2.1)), speed_m_s=6.0, loop_from=0, kind="car")
-    return parts.world(), {"street": route}
+    lanes = [(-185.0, -11.0), (185.0, -11.0), (185.0, 3.0), (-185.0, 3.0)]
+    walks = (
+        [(-180.0, 10.4), (180.0, 10.4), (180.0, 11.0), (-180.0, 11.0)],
+        [(-180, 26), (180, 26), (180, 27), (-180, 27)],
+    )
+    tracks = Tracks((over_ground(lanes, flat),), tuple(over_ground(walk, flat) for walk in walks))
+    return parts.world(), {"street": route}, tracks
 
 
-def panels(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
+def panels(rng: np.random.Generator) -> Place:
     """Reference panels of 1 m2 at 5 to 60 m around a tripod: the sensor verification of the source's appendix B."""
     parts = Parts()
     parts.add("ground", "grass", quad((-300, -300, 0), (600, 0, 0), (0, 600, 0)))
@@ -151,11 +181,11 @@ def panels(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
         distance, heading = distances[i // 3], np.radians(headings[slot])
         at = np.array([distance * np.sin(heading), distance * np.cos(heading), 1.5])
         add_panel(parts, f"{material} at {distance:.0f} m", material, at, headings[slot] + 180.0)
-    return parts.world(), {"stand": Route(points_m=((0.0, 0.0, 1.5),), heading_deg=0.0, kind="tripod")}
+    return parts.world(), {"stand": Route(points_m=((0.0, 0.0, 1.5),), heading_deg=0.0, kind="tripod")}, Tracks()
 
 
 _LEVEL: Final = Mount(lidar=LidarMount(position_m=(0.0, 0.0, 0.0), pitch_deg=0.0))
-SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], tuple[World, dict[str, Route]]], Mount]]] = {
+SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] = {
     "village": (village, Mount()),
     "field": (field_scene, Mount()),
     "facade": (facade, Mount()),
@@ -183,7 +213,7 @@ def scene(name: str, seed: int, route: str = "") -> Scene:
     if name not in SCENES:
         raise UsageError(f"scene {name!r} is not known; known are {', '.join(SCENES)}")
     build, mount = SCENES[name]
-    world, routes = build(generator(seed, f"scene {name}"))
+    world, routes, tracks = build(generator(seed, f"scene {name}"))
     if route and route not in routes:
         raise UsageError(f"route {route!r} is not known in scene {name}; known are {', '.join(routes)}")
-    return Scene(name, world, routes[route or next(iter(routes))], mount)
+    return Scene(name, world, routes[route or next(iter(routes))], mount, tracks)

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from simulator.buildings import Windows, add_car, add_house, add_tree
 from simulator.meshes import box, height_grid, prism, quad
+from simulator.moving import Tracks, over_ground
 from simulator.parts import Parts, World
 from simulator.route import Route
 
@@ -162,7 +163,7 @@ def _round(first: int, clockwise: bool) -> list[tuple[float, float]]:
     return corners[first:] + corners[:first]
 
 
-def town(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
+def town(rng: np.random.Generator) -> tuple[World, dict[str, Route], Tracks]:
     """Nine blocks of four houses, streets, parked cars, trees, lamps and fences, and fields in the north, on undulating ground."""
     parts = Parts()
     _add_ground(parts, rng)
@@ -173,7 +174,8 @@ def town(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
     start = int(rng.integers(12))
     tour = _tour(start)
     patrol = followed(tour, rng.uniform(5.5, 9.0, len(tour)), 15.0)
-    around = _round(int(rng.integers(4)), bool(rng.random() < 0.5))
+    first, clockwise = int(rng.integers(4)), bool(rng.random() < 0.5)
+    around = _round(first, clockwise)
     drive = followed(around, np.full(4, 2.1))
     strips = []
     for i, y in enumerate(np.arange(10.0, 151.0, 20.0)):
@@ -181,8 +183,16 @@ def town(rng: np.random.Generator) -> tuple[World, dict[str, Route]]:
         height = float(rng.uniform(32.0, 50.0))
         strips += [(x, float(y), height) for x in ends]
     cross = [(-30.0, 155.0, 40.0), (-30.0, 5.0, 40.0), (0.0, 5.0, 45.0), (0.0, 155.0, 45.0)]
-    return parts.world(), {
+    # the other way round, so that traffic meets the drive in its own lane; and round the whole town
+    outer = [(-136.6, -106.6), (136.6, -106.6), (136.6, 106.6), (-136.6, 106.6)]
+    walks = [[(x + 4.4, -103.0), (x + 4.4, 103.0), (x + 5.2, 103.0), (x + 5.2, -103.0)] for x in _ACROSS_M]
+    tracks = Tracks(
+        cars=tuple(over_ground(way, town_height) for way in (_round(first, not clockwise), outer)),
+        people=tuple(over_ground(way, town_height) for way in walks),
+    )
+    routes = {
         "patrol": Route(points_m=patrol, speed_m_s=5.0, loop_from=0),
         "drive": Route(points_m=drive, speed_m_s=6.0, loop_from=0, smooth_s=0.7, kind="car"),
         "strips": Route(points_m=(*strips, *cross), speed_m_s=9.0, loop_from=0, smooth_s=1.5),
     }
+    return parts.world(), routes, tracks

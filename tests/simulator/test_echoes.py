@@ -27,6 +27,8 @@ def echoes_of(hits, planes, material, clear=None, threshold=EVERYTHING):
         np.ones((1, 2)),
         threshold,
         100.0,
+        np.zeros((0, 4)),
+        np.zeros(0, np.uint8),
     )[0]
 
 
