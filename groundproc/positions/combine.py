@@ -202,14 +202,12 @@ def _moved(
         covariance_m2=covariance,
         quality=quality,
         ratio=ratio,
-        velocity_m_s=None,
-        velocity_covariance_m2_s2=None,
     )
 
 
 def _joined(parts: list[Solution]) -> Solution:
     """Solutions of different epochs as one in time order."""
-    names = (
+    names: tuple[str, ...] = (
         "time_ns",
         "latitude_deg",
         "longitude_deg",
@@ -220,6 +218,10 @@ def _joined(parts: list[Solution]) -> Solution:
         "age_s",
         "ratio",
     )
+    if all(
+        part.velocity_m_s is not None for part in parts
+    ):  # of the epoch's Doppler shifts alone: the same in both runs
+        names += ("velocity_m_s", "velocity_covariance_m2_s2")
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    whole = dataclasses.replace(parts[0], **columns, velocity_m_s=None, velocity_covariance_m2_s2=None)
+    whole = dataclasses.replace(parts[0], **({"velocity_m_s": None, "velocity_covariance_m2_s2": None} | columns))
     return whole.rows(np.argsort(whole.time_ns, kind="stable"))

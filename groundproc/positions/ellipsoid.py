@@ -31,7 +31,8 @@ def geodetic_from_ecef(place_m: Array) -> tuple[Array, Array, Array]:
 def mat_ecef_enu(latitude_deg: Array, longitude_deg: Array) -> Array:
     """Column matrices "geocentric from east, north, up of the place", shape (..., 3, 3)."""
     lat, lon = np.deg2rad(latitude_deg), np.deg2rad(longitude_deg)
-    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    with np.errstate(invalid="ignore"):  # what is no place has no axes; whoever reads files sorts them out
+        sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
     east = np.stack([-sin_lon, cos_lon, np.zeros_like(lat)], axis=-1)
     north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=-1)
     up = np.stack([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat], axis=-1)

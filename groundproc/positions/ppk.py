@@ -111,7 +111,7 @@ class PpkOptions:
             "out-solformat": "llh",
             "out-outhead": "on",
             "out-outopt": "on",
-            "out-outvel": "off",
+            "out-outvel": "on",
             "out-outsingle": "on",
             "out-timesys": "gpst",
             "out-timeform": "hms",
@@ -330,14 +330,11 @@ def _checked(inputs: Sequence[_Input], where: Base) -> tuple[rinex.Observations,
             f"{base_name}: covers {_stretch(base_seen)}, but the rover {rover_name} {_stretch(seen)}: they do not overlap in time"
         )
     if where.position is None and not where.averaged:
-        if base_seen.approximate_m is None:
-            raise PpkError(
-                f"{base_name}: its header states no position; give --base-position, or --base-average for a rough one"
-            )
+        help_is = "give --base-position, or --base-average for a rough one"
         if inputs[1].converted:
-            raise PpkError(
-                f"{base_name}: a UBX file states no surveyed position; give --base-position, or --base-average for a rough one"
-            )
+            raise PpkError(f"{base_name}: a UBX file states no surveyed position; {help_is}")
+        if base_seen.approximate_m is None:
+            raise PpkError(f"{base_name}: its header states no position; {help_is}")
     _check_ephemerides(inputs, seen, rover_name)
     notes = []
     if overlap_s < 0.99 * seen.seconds:

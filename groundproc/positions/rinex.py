@@ -19,9 +19,11 @@ _HEADER_LINES: Final = 5000
 _TWO_DIGITS: Final = 80
 _UBX_RAW: Final = (b"\xb5\x62\x02\x15", b"\xb5\x62\x02\x10")
 """RXM-RAWX and the older RXM-RAW."""
-_V2_EPOCH: Final = re.compile(r"^ (\d\d) ([ \d]\d) ([ \d]\d) ([ \d]\d) ([ \d]\d)([ \d]{2}\d\.\d{7})  ([0-6])([ \d]{3})")
+_V2_EPOCH: Final = re.compile(
+    r"^ (\d\d) ([ \d]\d) ([ \d]\d) ([ \d]\d) ([ \d]\d)((?:  \d| \d\d|\d{3})\.\d{7})  ([0-6])(  \d| \d\d|\d{3})"
+)
 _V3_EPOCH: Final = re.compile(
-    r"^> (\d{4}) ([ \d]\d) ([ \d]\d) ([ \d]\d) ([ \d]\d)([ \d]{2}\d\.\d{7})  ([0-6])([ \d]{3})"
+    r"^> (\d{4}) ([ \d]\d) ([ \d]\d) ([ \d]\d) ([ \d]\d)((?:  \d| \d\d|\d{3})\.\d{7})  ([0-6])(  \d| \d\d|\d{3})"
 )
 
 
@@ -103,6 +105,8 @@ def observations(path: Path) -> Observations:
         types = _observation_header(lines, found, path)
         epochs = _v3_epochs(lines) if found.version >= 3 else _v2_epochs(lines, types)
         for time_ns in epochs:
+            if time_ns is None:
+                continue
             if not found.epochs or time_ns < found.start_ns:
                 found.start_ns = time_ns
             found.end_ns = max(found.end_ns, time_ns)
@@ -151,7 +155,7 @@ def _float(text: str) -> float:
         return 0.0
 
 
-def _v3_epochs(lines: Iterator[str]) -> Iterator[int]:
+def _v3_epochs(lines: Iterator[str]) -> Iterator[int | None]:
     for line in lines:
         if line.startswith(">"):
             found = _V3_EPOCH.match(line)
@@ -159,7 +163,7 @@ def _v3_epochs(lines: Iterator[str]) -> Iterator[int]:
                 yield _calendar_ns(int(found[1]), found.groups())
 
 
-def _v2_epochs(lines: Iterator[str], types: int) -> Iterator[int]:
+def _v2_epochs(lines: Iterator[str], types: int) -> Iterator[int | None]:
     """Epoch lines of version 2; the lines of observations between them are passed over by their number."""
     for line in lines:
         found = _V2_EPOCH.match(line)
@@ -179,16 +183,19 @@ def _year(two: int) -> int:
     return two + (1900 if two >= _TWO_DIGITS else 2000)
 
 
-def _calendar_ns(year: int, words: tuple[str, ...]) -> int:
-    """Nanoseconds since 1970 of the month, day, hour, minute and second at places 1 to 5."""
+def _calendar_ns(year: int, words: tuple[str, ...]) -> int | None:
+    """Nanoseconds since 1970 of the month, day, hour, minute and second at places 1 to 5; None where they are no date."""
     month, day, hour, minute = (int(word) for word in words[1:5])
     whole, _, rest = words[5].strip().partition(".")
-    base = round(datetime(year, month, day, tzinfo=UTC).timestamp())
+    try:
+        base = round(datetime(year, month, day, tzinfo=UTC).timestamp())
+    except ValueError:
+        return None
     return (base + hour * 3600 + minute * 60 + int(whole)) * NS_PER_S + int(rest.ljust(9, "0"))
 
 
 _V2_EPHEMERIS: Final = re.compile(
-    r"^([ \d]\d) (\d\d) ([ \d]\d) ([ \d]\d) ([ \d]\d) ([ \d]\d)([ \d]{2}\d\.\d)[ -]\d?\.\d"
+    r"^([ \d]\d) (\d\d) ([ \d]\d) ([ \d]\d) ([ \d]\d) ([ \d]\d)((?:  \d| \d\d|\d{3})\.\d)[ -]\d?\.\d"
 )
 _V3_EPHEMERIS: Final = re.compile(r"^([GREJCIS][ \d]\d) (\d{4}) (\d\d) (\d\d) (\d\d) (\d\d) (\d\d)[ -]")
 
@@ -215,7 +222,9 @@ def navigation(path: Path) -> Navigation:
             if match:
                 name, year, *rest = match.groups()
                 name, number = (name, int(year)) if found.version >= 3 else (f"{system}{name}", _year(int(year)))
-                found.times_ns.setdefault(name, []).append(_calendar_ns(number, ("", *rest)))
+                time_ns = _calendar_ns(number, ("", *rest))
+                if time_ns is not None:
+                    found.times_ns.setdefault(name, []).append(time_ns)
     if not found.times_ns:
         raise LogError(f"{path}: holds no ephemeris, expected a RINEX navigation file")
     return found

@@ -5,6 +5,7 @@ degrees, degrees-minutes-seconds, geocentric, or a baseline from a stated base. 
 """
 
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -28,8 +29,16 @@ Array = npt.NDArray[np.float64]
 _FIRST: Final = {"latitude": "llh", "x-ecef": "xyz", "e-baseline": "enu"}
 _COLUMN_LINE: Final = re.compile(r"^%\s+(GPST|UTC|JST)\s*(\S?)\s*((?:latitude|x-ecef|e-baseline)\(.*)$")
 _SIGMAS: Final = {"llh": "sdn", "xyz": "sdx", "enu": "sde"}
-_NEEDED: Final = ("Q", "ns", "age", "ratio")
+_COLUMNS: Final = {
+    "llh": ("latitude", "longitude", "height", "Q", "ns", "sdn", "sde", "sdu", "", "", "", "age", "ratio"),
+    "xyz": ("x-ecef", "y-ecef", "z-ecef", "Q", "ns", "sdx", "sdy", "sdz", "", "", "", "age", "ratio"),
+    "enu": ("e-baseline", "n-baseline", "u-baseline", "Q", "ns", "sde", "sdn", "sdu", "", "", "", "age", "ratio"),
+}
 _WEEK_S: Final = 604_800
+_LATEST_NS: Final = 1 << 62
+_NEAREST_M: Final = 6.3e6
+_FARTHEST_M: Final = 6.5e6
+"""From the centre of the Earth."""
 _JST_AHEAD_S: Final = 9 * 3600
 _FORMAT: Final = "RTKLIB .pos"
 
@@ -73,9 +82,7 @@ def read_pos(path: Path) -> Solution:
         It cannot be read, has no line of column names, or holds no position.
     """
     header, table, times, damaged = _parse(path)
-    missing = [name for name in (*_NEEDED, _SIGMAS[header.layout]) if name not in header.names]
-    if missing:
-        raise LogError(f"{path}: its line of column names has no {missing[0]}; is it RTKLIB's?")
+    _check_columns(header, path)
     if header.datum != "WGS84":
         raise LogError(f"{path}: its datum is {header.datum}, expected WGS84")
     column = {name: table[:, i] for i, name in enumerate(header.names)}
@@ -107,6 +114,16 @@ def read_pos(path: Path) -> Solution:
         left_out={"damaged": damaged} if damaged else {},
     )
     return tidied(_uncombined(found, header) if header.combined else found, str(path))
+
+
+def _check_columns(header: _Header, path: Path) -> None:
+    """The columns that RTKLIB always writes, in its order; the three roots of covariances have names of several spellings."""
+    places = tuple(name for name in header.names if not name.endswith("'"))
+    for found, expected in itertools.zip_longest(places[:13], _COLUMNS[header.layout]):
+        if expected and found != expected:
+            raise LogError(
+                f"{path}: its line of column names has {found or 'nothing'} in the place of {expected}; is it RTKLIB's?"
+            )
 
 
 def _uncombined(solution: Solution, header: _Header) -> Solution:
@@ -171,7 +188,7 @@ def _header_line(line: str, header: _Header) -> None:
     elif colon and label == "ref pos":
         header.base = value
     elif colon and label == "solution":
-        header.combined = value == "combined"
+        header.combined = value.lower() == "combined"
     elif colon and label == "val thres":
         header.ratio_threshold = _number(value)
     elif colon and label == "program":
@@ -187,6 +204,8 @@ def _columns(found: re.Match[str], header: _Header) -> None:
         header.separator = "\t"
     words = rest.split(header.separator)
     names = [word.strip().partition("(")[0] for word in words]
+    if names[0] not in _FIRST:
+        return
     header.layout = _FIRST[names[0]]
     header.sexagesimal = "'" in words[0]
     if header.sexagesimal:
@@ -209,7 +228,7 @@ def _row(line: str, header: _Header) -> tuple[int, list[float]] | None:
         values = [float(word) for word in words]
     except (ValueError, IndexError):
         return None
-    if len(values) != len(header.names) or not all(map(math.isfinite, values)):
+    if len(values) != len(header.names) or not all(map(math.isfinite, values)) or not 0 <= time_ns < _LATEST_NS:
         return None
     return time_ns, values
 
@@ -251,15 +270,15 @@ def _base(header: _Header, path: Path) -> tuple[float, float, float] | None:
     """The base station's place, geocentric [m]; None where the file names none."""
     words = header.base.replace(header.separator or " ", " ").split()
     values = [_number(word) for word in words]
-    given = bool(values) and all(map(math.isfinite, values)) and any(values)
-    if given and header.layout == "xyz" and len(values) == 3:
-        return values[0], values[1], values[2]
-    if given and len(values) in (3, 7):
-        latitude, longitude = (
-            (values[0], values[1]) if len(values) == 3 else (_degrees(values[:3]), _degrees(values[3:6]))
-        )
-        x, y, z = ecef_from_geodetic(np.array(latitude), np.array(longitude), np.array(values[-1]))
-        return float(x), float(y), float(z)
+    place = None
+    if len(values) == 3 and header.layout == "xyz":
+        place = np.array(values)
+    elif len(values) in (3, 7):
+        angles = values[:2] if len(values) == 3 else [_degrees(values[:3]), _degrees(values[3:6])]
+        place = ecef_from_geodetic(np.array(angles[0]), np.array(angles[1]), np.array(values[-1]))
+    # RTKLIB writes zeros where there is no base
+    if place is not None and _NEAREST_M < float(np.linalg.norm(place)) < _FARTHEST_M and any(values):
+        return float(place[0]), float(place[1]), float(place[2])
     if header.layout == "enu":
         raise LogError(f"{path}: has baselines, but no line of the base station's place (% ref pos)")
     return None
@@ -329,7 +348,7 @@ def _velocity(header: _Header, table: Array, mat_place: Array | None) -> tuple[A
 _HEAD: Final = (
     "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)\n"
     "%  GPST                     latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
-    "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio\n"
+    "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio    vn(m/s)    ve(m/s)    vu(m/s)      sdvn     sdve     sdvu    sdvne    sdveu    sdvun\n"
 )
 
 
@@ -340,15 +359,28 @@ def write_pos(file: TextIO, solution: Solution, comments: Iterable[str]) -> None
     assert solution.ratio is not None
     file.writelines(f"% {comment}\n" for comment in comments)
     file.write("%\n" + _HEAD)
-    c = solution.covariance_m2
-    pairs = [(1, 1), (0, 0), (2, 2), (1, 0), (0, 2), (2, 1)]
-    root = np.stack([np.copysign(np.sqrt(np.abs(c[:, i, j])), c[:, i, j]) for i, j in pairs], axis=-1)
+    velocity, velocity_covariance = np.zeros((len(solution), 3)), np.zeros((len(solution), 3, 3))
+    if solution.velocity_m_s is not None and solution.velocity_covariance_m2_s2 is not None:
+        stated = np.isfinite(solution.velocity_m_s).all(axis=1)
+        velocity[stated], velocity_covariance[stated] = (
+            solution.velocity_m_s[stated],
+            solution.velocity_covariance_m2_s2[stated],
+        )
+    roots, velocity_roots = _roots(solution.covariance_m2), _roots(velocity_covariance)
     for k, time_ns in enumerate(gps_calendar_from_utc(solution.time_ns).tolist()):
-        sigmas = "".join(f" {value:8.4f}" for value in root[k])
+        east, north, up = velocity[k]
         file.write(
             f"{_calendar(time_ns)} {solution.latitude_deg[k]:14.9f} {solution.longitude_deg[k]:14.9f} {solution.height_m[k]:10.4f} "
-            f"{solution.quality[k]:3d} {int(solution.satellites[k]):3d}{sigmas} {solution.age_s[k]:6.2f} {solution.ratio[k]:6.1f}\n"
+            f"{solution.quality[k]:3d} {int(solution.satellites[k]):3d}{''.join(f' {value:8.4f}' for value in roots[k])} "
+            f"{solution.age_s[k]:6.2f} {solution.ratio[k]:6.1f} {north:10.5f} {east:10.5f} {up:10.5f} "
+            f"{''.join(f' {value:8.5f}' for value in velocity_roots[k])}\n"
         )
+
+
+def _roots(covariance: Array) -> Array:
+    """Roots of covariances with their signs in RTKLIB's order n, e, u, ne, eu, un, shape (n, 6)."""
+    values = np.stack([covariance[:, i, j] for i, j in ((1, 1), (0, 0), (2, 2), (1, 0), (0, 2), (2, 1))], axis=-1)
+    return np.asarray(np.copysign(np.sqrt(np.abs(values)), values))
 
 
 def _calendar(time_ns: int) -> str:

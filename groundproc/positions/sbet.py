@@ -30,6 +30,14 @@ RECORD: Final = np.dtype([(name, "<f8") for name in _NAMES])
 ACCURACY_RECORD: Final = np.dtype([(name, "<f8") for name in _ACCURACY])
 _WEEK_S: Final = 604_800
 _MINUTE_RAD: Final = np.pi / 180 / 60
+_LARGEST: Final = {
+    "time": 1e11, "latitude": np.pi / 2, "longitude": 2 * np.pi, "altitude": 1e5, "x_velocity": 1e4, "y_velocity": 1e4,
+    "z_velocity": 1e4, "roll": 7.0, "pitch": 7.0, "platform_heading": 7.0, "wander_angle": 7.0,
+}  # fmt: skip
+"""Magnitudes that values cannot exceed; angles are written within a turn."""
+_MOST: Final = 0.9
+"""This part of the first records must be sound for a file to be taken for an SBET."""
+_LONGEST_STEP_S: Final = 60.0
 _VELOCITY_MISFIT: Final = 0.1
 """Velocities may contradict the positions by this part of the speed, plus 0.1 m/s."""
 
@@ -39,16 +47,7 @@ def looks_like_sbet(head: bytes, size: int) -> bool:
     records = _whole(head, RECORD, size)
     if records is None:
         return False
-    with np.errstate(invalid="ignore"):
-        return bool(
-            _rising(records["time"])
-            and (np.abs(records["latitude"]) <= np.pi / 2).all()
-            and (np.abs(records["longitude"]) <= 2 * np.pi).all()
-            and (np.abs(records["altitude"]) < 1e5).all()
-            and all(
-                (np.abs(records[name]) <= 7.0).all() for name in ("roll", "pitch", "platform_heading", "wander_angle")
-            )
-        )
+    return _rising(records["time"]) and float(_sound(records).mean()) > _MOST
 
 
 def looks_like_accuracy(head: bytes, size: int) -> bool:
@@ -68,10 +67,10 @@ def _whole(head: bytes, record: np.dtype[np.void], size: int) -> npt.NDArray[np.
 
 
 def _rising(time_s: Array) -> bool:
-    step = np.diff(time_s)
-    return bool(
-        np.isfinite(time_s).all() and (np.abs(time_s) < 10 * _WEEK_S).all() and (step > 0).all() and (step < 60.0).all()
-    )
+    """Whether most steps are forward and short: a week's end or a damaged record is no reason to doubt."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        step = np.diff(time_s)
+        return len(step) == 0 or float(np.mean((step > 0) & (step < _LONGEST_STEP_S))) > _MOST
 
 
 def read_sbet(
@@ -106,7 +105,10 @@ def read_sbet(
     UsageError
         Neither `week` nor `near_utc_ns` is given.
     """
-    records = _read(path, RECORD, "an SBET (17 doubles a record)")
+    whole = _read(path, RECORD, "an SBET (17 doubles a record)")
+    records = whole[_sound(whole)]
+    if not len(records):
+        raise LogError(f"{path}: none of its {len(whole)} records holds a place, a velocity and an attitude")
     time_ns = _utc_ns(records["time"], path, near_utc_ns, week, utc_seconds)
     heading = records["platform_heading"] - records["wander_angle"]
     quat = frames.quat_from_mat(frames.mat_local_ins(heading, records["pitch"], records["roll"]))
@@ -130,10 +132,20 @@ def read_sbet(
             velocity_covariance_m2_s2=None if speed is None else velocity,
             quat_place_ins_wxyz=quat,
             attitude_covariance_rad2=attitude,
+            left_out={"damaged": len(whole) - len(records)} if len(records) < len(whole) else {},
             notes=(note,) if note else (),
         ),
         str(path),
     )
+
+
+def _sound(records: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Which records hold values that can be, shape (n,)."""
+    with np.errstate(invalid="ignore"):
+        found = np.ones(len(records), bool)
+        for name, limit in _LARGEST.items():
+            found &= np.abs(records[name]) <= limit
+    return found
 
 
 def _read(path: Path, record: np.dtype[np.void], what: str) -> npt.NDArray[np.void]:
@@ -144,8 +156,6 @@ def _read(path: Path, record: np.dtype[np.void], what: str) -> npt.NDArray[np.vo
         records = np.fromfile(path, record)
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from None
-    if not np.isfinite(records["time"]).all():
-        raise LogError(f"{path}: a time in it is no number, expected {what}")
     return records
 
 
@@ -182,6 +192,8 @@ def _covariances(time_s: Array, accuracy: Path | None, path: Path) -> tuple[Arra
         unknown = np.full((len(time_s), 3, 3), np.nan)
         return unknown, unknown, unknown
     records = _read(accuracy, ACCURACY_RECORD, "an SBET's accuracy file (10 doubles a record)")
+    if not (np.isfinite(records["time"]).all() and (np.diff(records["time"]) > 0).all()):
+        raise LogError(f"{accuracy}: its times do not increase; is it an SBET's accuracy file?")
     start, end = float(records["time"][0]), float(records["time"][-1])
     if not (start - 1.0 <= time_s[0] and time_s[-1] <= end + 1.0):
         raise LogError(

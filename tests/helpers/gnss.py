@@ -198,6 +198,7 @@ def measure(
     clock: tuple[float, float] = (0.0, 0.0),
     code_sigma_m: float = 0.5,
     phase_sigma_m: float = 0.003,
+    doppler_sigma_m_s: float = 0.03,
     mask_deg: float = 8.0,
 ) -> Receiver:
     """Observations at a receiver's own epochs; its clock is off by clock[0] + clock[1] * (time since the first epoch).
@@ -205,28 +206,32 @@ def measure(
     White noise grows with low elevation: sigma^2 = s^2 (1 + 1 / sin^2), as RTKLIB's model has it.
     """
     rng = np.random.default_rng(seed)
-    error_s = clock[0] + clock[1] * (tow_s - tow_s[0])
-    t = tow_s - error_s
-    place = path(t)
-    sent = np.repeat(t[:, None] - 0.075, len(orbits.prn), axis=1)
-    for _ in range(6):
-        satellite, clock_s = orbits.at(sent)
-        turn = EARTH_RATE * (t[:, None] - sent)
-        x, y = satellite[..., 0], satellite[..., 1]
-        turned = np.stack(
-            [x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn), satellite[..., 2]], -1
-        )
-        line = turned - place[:, None]
-        distance = np.linalg.norm(line, axis=-1)
-        sine = _elevation_sine(place, line / distance[..., None])
-        delayed = distance + _troposphere_m(place, sine)
-        sent = t[:, None] - delayed / C_M_S
-    full = delayed + C_M_S * (error_s[:, None] - clock_s)
+
+    def ranges(reading_s: Array) -> tuple[Array, Array, Array, Array]:
+        """Noiseless pseudoranges, sine of elevation, places and clock errors when the receiver's clock reads so."""
+        error_s = clock[0] + clock[1] * (reading_s - tow_s[0])
+        t = reading_s - error_s
+        place = path(t)
+        sent = np.repeat(t[:, None] - 0.075, len(orbits.prn), axis=1)
+        for _ in range(6):
+            satellite, clock_s = orbits.at(sent)
+            turn = EARTH_RATE * (t[:, None] - sent)
+            x, y = satellite[..., 0], satellite[..., 1]
+            turned = [x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn), satellite[..., 2]]
+            line = np.stack(turned, axis=-1) - place[:, None]
+            distance = np.linalg.norm(line, axis=-1)
+            sine = _elevation_sine(place, line / distance[..., None])
+            delayed = distance + _troposphere_m(place, sine)
+            sent = t[:, None] - delayed / C_M_S
+        return delayed + C_M_S * (error_s[:, None] - clock_s), sine, place, error_s
+
+    full, sine, place, error_s = ranges(tow_s)
+    rate = (ranges(tow_s + 0.01)[0] - ranges(tow_s - 0.01)[0]) / 0.02
     scale = np.sqrt(1 + 1 / np.maximum(sine, 0.1) ** 2)
     code = full + code_sigma_m * scale * rng.normal(size=full.shape)
     cycles = rng.integers(-50_000, 50_000, len(orbits.prn))
     phase = (full + phase_sigma_m * scale * rng.normal(size=full.shape)) / LAMBDA_M + cycles
-    rate = np.gradient(full, tow_s, axis=0) if len(tow_s) > 1 else np.zeros_like(full)
+    rate += doppler_sigma_m_s * scale * rng.normal(size=full.shape)
     hidden = sine < np.sin(np.deg2rad(mask_deg))
     values = [np.where(hidden, np.nan, v) for v in (code, phase, -rate / LAMBDA_M)]
     return Receiver(orbits.week, tow_s, orbits.prn, *values, error_s, place)
