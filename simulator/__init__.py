@@ -12,11 +12,13 @@ Chance
 
 Map
 ---
-config, chance, clocks, geodesy       options; random streams; what each clock shows; local frame to latitude and longitude
-materials, meshes, buildings, scene   reflectances at 905 nm; shapes as triangles; houses; the named scenes
-route, flight                         where to fly; position, attitude and rates at any time
-rays, echoes, lidar, telemetry        beams against triangles; echoes of a beam; data packets; position packets
-ins, autopilot                        what the INS believes; what it says over MAVLink
-faults, capture, truth, render        what goes wrong; pcap and tlog; truth files; the chunks in order
-play, command                         live to UDP and a pty; `swath simulate`
+config, chance, clocks, geodesy            options; random streams; what each clock shows; local frame to latitude and longitude
+plans, flights/                            named flights: scene, route, duration and errors in one file each
+materials, meshes, parts, buildings        reflectances at 905 nm; shapes as triangles; houses
+scene, ground, town, lake                  the named scenes
+route, flight                              where to fly; position, attitude and rates at any time
+rays, moving, echoes, lidar, telemetry     beams against triangles; cars and people; echoes of a beam; data packets; position packets
+imu, ins, autopilot                        constant errors of inertial sensors; what the INS believes; what it says over MAVLink
+faults, capture, truth, render             what goes wrong; pcap and tlog; truth files; the chunks in order
+play, command                              live to UDP and a pty; `swath simulate`
 """

@@ -128,11 +128,11 @@ class Simulation:
         low, high = self.clocks.lidar.time_s(edges_s)
         return float(low), min(float(high), self.job.duration_s)
 
-    def sweep(self, chunk: int) -> Sweep:
-        """Render the data packets of a piece; safe in any thread."""
+    def sweep(self, chunk: int, truth: bool = True) -> Sweep:
+        """Render the data packets of a piece, and the truth about them; safe in any thread."""
         first = chunk * self.chunk_packets
         last = min(first + self.chunk_packets, self.lidar.packets_until(self.job.duration_s) - 1)
-        return self.lidar.sweep(first, max(last - first, 0))
+        return self.lidar.sweep(first, max(last - first, 0), truth)
 
     def truth(self) -> dict[str, Any]:
         """All that is true and not a pose or a point."""
@@ -186,7 +186,7 @@ def in_order(simulation: Simulation, workers: int) -> Iterator[Sweep]:
     with ThreadPoolExecutor(workers) as pool:
         ahead: deque[Future[Sweep]] = deque()
         for chunk in range(simulation.chunks):
-            ahead.append(pool.submit(simulation.sweep, chunk))
+            ahead.append(pool.submit(simulation.sweep, chunk, simulation.job.truth_points))
             if len(ahead) > workers + 1:
                 yield ahead.popleft().result()
         while ahead:
