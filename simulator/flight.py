@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 _VIBRATION_LINES: Final = 9
 _WANDER_LINES: Final = 14
 _GENTLE_S: Final = 3.0
+_BLOCK: Final = 20_000
 _SHARE: Final = {"copter": 1.0, "car": 0.35, "tripod": 0.0}
 """Of vibration and wander, by what carries the instrument."""
 
@@ -64,8 +65,12 @@ class _Sines:
         amplitude = self.amplitude * turn**derivative
         if gain is not None:
             amplitude = amplitude * gain(self.frequency_hz)
-        argument = turn * np.asarray(time_s)[:, None, None] + self.phase + derivative * np.pi / 2
-        return np.asarray((amplitude * np.sin(argument)).sum(axis=1))
+        time_s, phase = np.asarray(time_s), self.phase + derivative * np.pi / 2
+        values = np.empty((len(time_s), 3))
+        for first in range(0, len(time_s), _BLOCK):  # an hour of all lines at once would be half a gigabyte
+            some = slice(first, first + _BLOCK)
+            values[some] = (amplitude * np.sin(turn * time_s[some, None, None] + phase)).sum(axis=1)
+        return values
 
 
 def _sines(rng: np.random.Generator, lines: int, band_hz: tuple[float, float], rms: float) -> _Sines:
