@@ -6,6 +6,8 @@ last line is one JSON object:
 
 cpu_ratio_to_tcpdump    CPU per packet, swathd's over that of `tcpdump -w` (null where tcpdump is missing or not allowed)
 cpu_ratio_to_recvfrom   the same over a Python loop of recvfrom and one MCAP message for each packet
+bare_ratio_to_tcpdump   the floor: CPU per packet of what swathd cannot do without, over that of tcpdump: recvmmsg with receive times
+                        as often as swathd, SHA-256, CRC-32, write, fdatasync twice a second; nothing looked at, no MCAP
 loss_at_1x, loss_at_20x share of the packets that swathd did not log, at the sensor's rate and at 20 times that
 cpu_percent_dual_return of one core, dual return at the sensor's rate and 1,000 MAVLink messages/s
 memory_mb               highest resident memory of swathd in all runs
@@ -13,6 +15,7 @@ memory_mb               highest resident memory of swathd in all runs
 
 import argparse
 import ctypes
+import hashlib
 import json
 import os
 import shutil
@@ -32,10 +35,12 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from fastcrc import crc32
 
 from flightlog import hdl32e, records
 from flightlog.constants import NS_PER_S
 from flightlog.logfile import LogReader, LogWriter
+from onboard.datagrams import Receiver, open_udp
 
 SENSOR_RATE: Final = NS_PER_S / hdl32e.PACKET_NS
 MAVLINK_RATE: Final = 1000
@@ -132,6 +137,9 @@ def send_main(options: argparse.Namespace) -> None:
     os.sched_setaffinity(0, {_SENDER_CORE})
     sender = Sender(packets(options.dual), options.port)
     mavlink = mavlink_sender(options.mavlink_port) if options.mavlink_port else None
+    if options.wait:  # until whoever measures says so: a sender that is starting sends nothing
+        print("ready", flush=True)
+        sys.stdin.readline()
     begin = time.monotonic()
     sent, told = 0, 0
     while (passed := time.monotonic() - begin) < options.seconds:
@@ -165,12 +173,23 @@ def mavlink_sender(port: int) -> Callable[[], None]:
     return send
 
 
-def send(rate: float, seconds: float, port: int, *, dual: bool = False, mavlink_port: int = 0) -> tuple[int, float]:
-    """Send from another process; datagrams sent and seconds taken."""
-    command = [sys.executable, __file__, "--send", f"--rate={rate}", f"--seconds={seconds}", f"--port={port}"]
+@contextmanager
+def sender(
+    rate: float, seconds: float, port: int, *, dual: bool = False, mavlink_port: int = 0
+) -> Iterator[Callable[[], tuple[int, float]]]:
+    """A process that is ready to send, and a function that lets it; that gives datagrams sent and seconds taken."""
+    command = [sys.executable, __file__, "--send", "--wait", f"--rate={rate}", f"--seconds={seconds}", f"--port={port}"]
     command += [f"--mavlink-port={mavlink_port}"] + ["--dual"] * dual
-    answer = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    return answer["sent"], answer["seconds"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        if process.stdout.readline() != "ready\n":
+            raise SystemExit("the sender did not start")
+
+        def go() -> tuple[int, float]:
+            answer = json.loads(process.communicate("go\n")[0])
+            return answer["sent"], answer["seconds"]
+
+        yield go
 
 
 # Recorders ------------------------------------------------------------------------------------------------------------
@@ -217,12 +236,21 @@ def recorder(command: list[str], settle_s: float = 1.5) -> Iterator[subprocess.P
             process.communicate(timeout=30)
 
 
-def measure(process: subprocess.Popen[bytes], sending: Callable[[], tuple[int, float]]) -> Run:
+def measure(
+    process: subprocess.Popen[bytes],
+    rate: float,
+    seconds: float,
+    port: int,
+    *,
+    dual: bool = False,
+    mavlink_port: int = 0,
+) -> Run:
     """Send to a recorder that runs, and see what it costs."""
-    before = cpu_s(process.pid)
-    sent, seconds = sending()
-    time.sleep(0.7)  # what is still in buffers is part of the work
-    return Run(sent, seconds, cpu_s(process.pid) - before, memory_mb=peak_memory_mb(process.pid))
+    with sender(rate, seconds, port, dual=dual, mavlink_port=mavlink_port) as go:
+        before = cpu_s(process.pid)
+        sent, took = go()
+        time.sleep(0.8)  # what is still in buffers is part of the work
+        return Run(sent, took, cpu_s(process.pid) - before, memory_mb=peak_memory_mb(process.pid))
 
 
 def run_swathd(
@@ -242,9 +270,7 @@ def run_swathd(
     config = folder / "swathd.yaml"
     config.write_text(json.dumps(settings))
     with recorder([sys.executable, "-m", "onboard.cli", "run", "--config", str(config)]) as process:
-        run = measure(
-            process, lambda: send(rate, seconds, port, dual=dual, mavlink_port=mavlink_port if mavlink else 0)
-        )
+        run = measure(process, rate, seconds, port, dual=dual, mavlink_port=mavlink_port if mavlink else 0)
     logged = 0
     kernel_drops = queue_drops = 0
     with LogReader(next(logs.glob("*.mcap"))) as log:
@@ -275,7 +301,7 @@ def run_tcpdump(folder: Path, rate: float, seconds: float) -> Run | None:
         sink.bind((ADDRESS, port))  # or the kernel answers each packet with an ICMP error
         try:
             with recorder(command) as process:
-                run = measure(process, lambda: send(rate, seconds, port))
+                run = measure(process, rate, seconds, port)
         except SystemExit as error:
             print(f"tcpdump cannot capture here ({error}); no ratio to it")
             return None
@@ -288,10 +314,48 @@ def run_recvfrom(folder: Path, rate: float, seconds: float) -> Run:
     port = free_port()
     log = folder / "recvfrom.mcap"
     with recorder([sys.executable, __file__, "--recvfrom", str(log), f"--port={port}"]) as process:
-        run = measure(process, lambda: send(rate, seconds, port))
+        run = measure(process, rate, seconds, port)
     with LogReader(log) as reader:
         logged = sum(1 for _ in reader.messages())
     return Run(run.sent, run.seconds, run.cpu_s, logged)
+
+
+def run_bare(folder: Path, rate: float, seconds: float) -> Run:
+    """One run of the loop below."""
+    port = free_port()
+    raw = folder / "bare.raw"
+    with recorder([sys.executable, __file__, "--bare", str(raw), f"--port={port}"]) as process:
+        run = measure(process, rate, seconds, port)
+    return Run(run.sent, run.seconds, run.cpu_s, raw.stat().st_size // records.SCAN_PACKET_DTYPE.itemsize)
+
+
+def bare_main(options: argparse.Namespace) -> None:
+    """Do what costs in proportion to the bytes, and as little else as Python can."""
+    from onboard.config import LidarConfig
+
+    pause_s, running = LidarConfig().poll_ms / 1e3, True
+
+    def stop(number: int, frame: object) -> None:
+        nonlocal running
+        running = False
+
+    signal.signal(signal.SIGTERM, stop)
+    sock = open_udp(ADDRESS, options.port, 8 << 20)
+    slots = np.zeros(1024, records.SCAN_PACKET_DTYPE)
+    receiver = Receiver(sock, slots, 8, hdl32e.DATA_BYTES)
+    content, size = slots.view(np.uint8).data, slots.dtype.itemsize
+    digest, checksum, polls = hashlib.sha256(), 0, 0
+    with options.bare.open("wb", buffering=0) as file:
+        while running:
+            time.sleep(pause_s)
+            data = bytes(content[: receiver.receive() * size])
+            file.write(data)
+            digest.update(data)
+            checksum = crc32.iso_hdlc(data, checksum)
+            polls += 1
+            if polls % 2 == 0:
+                os.fdatasync(file.fileno())
+    print(digest.hexdigest(), checksum)
 
 
 def recvfrom_main(options: argparse.Namespace) -> None:
@@ -335,18 +399,22 @@ def main() -> None:
     """Run the benchmark, or the part of it that a process of its own plays."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of one run")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of one run")
     parser.add_argument("--send", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--rate", type=float, help=argparse.SUPPRESS)
     parser.add_argument("--port", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--mavlink-port", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--dual", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--wait", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--recvfrom", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--bare", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.send:
         send_main(options)
     elif options.recvfrom:
         recvfrom_main(options)
+    elif options.bare:
+        bare_main(options)
     else:
         with tempfile.TemporaryDirectory(prefix="swath-capture-") as folder:
             print(json.dumps(benchmark(Path(folder), options.rounds, options.seconds)))
@@ -356,6 +424,7 @@ def benchmark(folder: Path, rounds: int, seconds: float) -> dict[str, float | No
     """Run all recorders in turn."""
     ours: list[Run] = []
     tcpdump: list[Run] = []
+    bare: list[Run] = []
     recvfrom: list[Run] = []
     for _ in range(rounds):
         ours.append(run_swathd(folder, SENSOR_RATE, seconds, fov=False))
@@ -363,6 +432,8 @@ def benchmark(folder: Path, rounds: int, seconds: float) -> dict[str, float | No
         if (run := run_tcpdump(folder, SENSOR_RATE, seconds)) is not None:
             tcpdump.append(run)
             say("tcpdump -w", run)
+        bare.append(run_bare(folder, SENSOR_RATE, seconds))
+        say("system calls and checksums alone", bare[-1])
         recvfrom.append(run_recvfrom(folder, SENSOR_RATE, seconds))
         say("recvfrom, a message each", recvfrom[-1])
     masked = run_swathd(folder, SENSOR_RATE, seconds, fov=True)
@@ -375,6 +446,7 @@ def benchmark(folder: Path, rounds: int, seconds: float) -> dict[str, float | No
     cost = median_cost(ours)
     return {
         "cpu_ratio_to_tcpdump": round(cost / median_cost(tcpdump), 3) if tcpdump else None,
+        "bare_ratio_to_tcpdump": round(median_cost(bare) / median_cost(tcpdump), 3) if tcpdump else None,
         "cpu_ratio_to_recvfrom": round(cost / median_cost(recvfrom), 3),
         "loss_at_1x": max(run.loss for run in ours),
         "loss_at_20x": fast.loss,
@@ -382,6 +454,7 @@ def benchmark(folder: Path, rounds: int, seconds: float) -> dict[str, float | No
         "memory_mb": round(max(run.memory_mb for run in (*ours, masked, fast, dual)), 1),
         "rate_at_20x": round(fast.sent / fast.seconds),
         "cpu_s_per_million": round(cost, 2),
+        "cpu_s_per_million_tcpdump": round(median_cost(tcpdump), 2) if tcpdump else None,
         "cpu_s_per_million_masked": round(masked.cpu_s_per_million, 2),
     }
 

@@ -7,7 +7,7 @@ is there and nothing else, and what was lost is known. It also copies and compre
 import contextlib
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import BinaryIO, Final
 
@@ -97,7 +97,8 @@ class McapWriter:
     Parameters
     ----------
     stream : BinaryIO
-        Opened for writing, empty; `write` takes all it is given or raises OSError.
+        Opened for writing, empty; `write` takes all it is given or raises OSError. Where it has a `write_pieces`, that is given the
+        pieces of a record at once.
     profile, library : str
         See the header record.
     chunk_bytes : int
@@ -116,6 +117,7 @@ class McapWriter:
     def __init__(self, stream: BinaryIO, profile: str, library: str, chunk_bytes: int, compression: str) -> None:
         assert compression in COMPRESSIONS
         self._stream, self._chunk_bytes, self._compression = stream, chunk_bytes, compression
+        self._write_pieces: Callable[[Sequence[bytes]], None] | None = getattr(stream, "write_pieces", None)
         self._offset = 0
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
@@ -133,8 +135,11 @@ class McapWriter:
         """Append whole records, or none of them; gives their place in the file."""
         begin = self._offset
         try:
-            for piece in pieces:
-                self._stream.write(piece)
+            if self._write_pieces is not None:
+                self._write_pieces(pieces)
+            else:
+                for piece in pieces:
+                    self._stream.write(piece)
         except OSError:
             with contextlib.suppress(OSError, ValueError):
                 self._stream.seek(begin)

@@ -5,7 +5,7 @@ import fcntl
 import hashlib
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
@@ -20,6 +20,10 @@ _CHUNK_BYTES: Final = 3 << 19
 """A little more than comes between two syncs, so that these close the chunks: one each, and little is lost with one."""
 
 
+_IOV_MAX: Final = 1024
+"""The kernel takes no more pieces in one call."""
+
+
 class _HashedFile:
     """An unbuffered file with the checksum of what was written to it: what the disk refuses is refused at once, to the byte."""
 
@@ -32,14 +36,23 @@ class _HashedFile:
 
     def write(self, data: bytes) -> int:
         """Write all of it, or raise OSError."""
-        view = memoryview(data)
-        done = self._raw.write(view)
-        while done < len(view):
-            done += self._raw.write(view[done:])
-        self.size += len(view)
-        if self._digest is not None:
-            self._digest.update(view)
-        return len(view)
+        self.write_pieces([data])
+        return len(data)
+
+    def write_pieces(self, pieces: Sequence[bytes]) -> None:
+        """Write all of them in one call, or raise OSError."""
+        for begin in range(0, len(pieces), _IOV_MAX):
+            some = pieces[begin : begin + _IOV_MAX]
+            size = sum(map(len, some))
+            done = os.writev(self._raw.fileno(), some)
+            if done < size:  # seldom: a disk that is nearly full
+                rest = memoryview(b"".join(some))
+                while done < size:
+                    done += self._raw.write(rest[done:])
+            self.size += size
+            if self._digest is not None:
+                for piece in some:
+                    self._digest.update(piece)
 
     def seek(self, offset: int) -> None:
         """Go back to where a record began that did not fit."""

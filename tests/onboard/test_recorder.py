@@ -101,13 +101,13 @@ def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_th
 
 
 def test_a_sync_follows_what_was_handed_over_when_it_is_nearly_due_and_no_sooner(tmp_path: Path) -> None:
-    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=1000), lambda: segment(tmp_path / "a.mcap"))
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=4000), lambda: segment(tmp_path / "a.mcap"))
     recorder.start()
-    for wait_s, syncs in ((0.1, 0), (0.82, 1)):  # of a second, seven eighths are near
+    for wait_s, syncs in ((0.1, 0), (3.55, 1)):  # of 4 s, seven eighths are near
         time.sleep(wait_s)
         recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, b"one")], "ins"), True)
         recorder.handed_over()
-        time.sleep(0.05)
+        time.sleep(0.1)
         assert recorder.counts.syncs == syncs
     with LogReader(tmp_path / "a.mcap") as log:
         assert len(list(log.messages(("/mavlink/",)))) == 2
