@@ -25,6 +25,8 @@ Array = npt.NDArray[np.float64]
 
 _TICK_HZ: Final = 50.0
 _GPS_HZ: Final = 5.0
+_FIX_LATE_S: Final = 0.12
+"""A fix comes in this long after its epoch."""
 _U32: Final = 1 << 32
 _JUST_AFTER_NS: Final = 200
 SYSTEM: Final = 1
@@ -56,6 +58,7 @@ class _Moment:
     boot_ns: int
     utc_ns: int
     epoch_ns: int
+    fix_boot_ns: int
     row: int
     belief: Belief
     geodetic: tuple[Array, Array, Array]
@@ -154,12 +157,13 @@ class Autopilot:
 
     def _moment(self, time_s: float, row: int, belief: Belief, place: tuple[Array, Array, Array]) -> _Moment:
         clock = self.boot_clock(time_s)
-        epoch_s = np.floor((time_s - 0.12) * _GPS_HZ) / _GPS_HZ
+        epoch_s = np.floor((time_s - _FIX_LATE_S) * _GPS_HZ) / _GPS_HZ
         return _Moment(
             time_s=time_s,
             boot_ns=int(clock.shows_ns(time_s)),
             utc_ns=int(self._clocks.utc.shows_ns(time_s)),
             epoch_ns=int(self._clocks.utc.shows_ns(epoch_s)),
+            fix_boot_ns=int(clock.shows_ns(epoch_s + _FIX_LATE_S)),
             row=row,
             belief=belief,
             geodetic=place,
@@ -207,8 +211,11 @@ class Autopilot:
         east, north, up = m.belief.velocity_m_s[m.row] * 100.0
         heading = round(np.degrees(m.belief.heading_rad[m.row]) * 100.0) % 36000
         relative_mm = round(m.belief.position_m[m.row, 2] * 1e3)
+        stamp_ms = m.boot_ms
+        if self._options.position_stamp == "fix" and not self._outage.holds(m.time_s):
+            stamp_ms = m.fix_boot_ns // NS_PER_MS % _U32
         return ardupilotmega.MAVLink_global_position_int_message(
-            m.boot_ms, latitude, longitude, height_mm, relative_mm, round(north), round(east), round(-up), heading
+            stamp_ms, latitude, longitude, height_mm, relative_mm, round(north), round(east), round(-up), heading
         )
 
     def _gps_raw_int(self, m: _Moment) -> Any:

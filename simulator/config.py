@@ -177,6 +177,11 @@ class LinkOptions:
         "unix time in SYSTEM_TIME: exact, or that of the last GPS epoch as 3.1.3 sends",
         choices=("exact", "epoch"),
     )
+    position_stamp: str = option(
+        "built",
+        "stamp of GLOBAL_POSITION_INT: when it was built, or when the last fix came in, as 3.1.3 has it",
+        choices=("built", "fix"),
+    )
     stamp_jitter_s: float = option(
         0.005,
         "a message's state is older or younger than its stamp by up to [s], uniform about zero",

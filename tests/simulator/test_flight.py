@@ -41,6 +41,27 @@ def test_specific_force_is_acceleration_plus_gravity_in_the_body(flight):
     assert np.abs(force - flight.specific_force_m_s2(time_s)).max() < 0.01
 
 
+def test_at_a_lever_arm_the_force_is_that_of_the_point_there(flight):
+    # calm: differences over 2 ms of a vibration at 40 Hz would miss its acceleration by (2 pi 40 * 0.002)^2 / 12 = 2 %
+    calm, lever = Flight(SQUARE, 20.0, FlightOptions(vibration_deg=0.0), seed=5), np.array([0.1, 0.3, -0.16])
+    time_s = np.arange(1.0, 19.0, 0.01)
+    position = [
+        calm.poses(time_s + d).position_m + rotations(calm, time_s + d).apply(lever) for d in (-0.002, 0.0, 0.002)
+    ]
+    acceleration = (position[0] - 2 * position[1] + position[2]) / 0.002**2
+    force = rotations(calm, time_s).inv().apply(acceleration + np.array([0, 0, 9.80665]))
+    assert np.abs(force - calm.specific_force_m_s2(time_s, lever)).max() < 0.01
+    # and it is another one than at the INS
+    assert np.abs(force - calm.specific_force_m_s2(time_s)).max() > 0.3
+
+
+def test_a_long_motion_is_the_same_in_blocks():
+    calm = Flight(SQUARE, 60.0, FlightOptions(), seed=5)
+    time_s = np.arange(0.0, 60.0, 0.002)  # more than one block
+    some = slice(19_990, 20_010)
+    assert (calm.poses(time_s).pitch_rad[some] == calm.poses(time_s[some]).pitch_rad).all()
+
+
 def test_a_multirotor_feels_hardly_any_sideways_force(flight):
     time_s = np.arange(4.0, 36.0, 0.01)
     force = flight.specific_force_m_s2(time_s)

@@ -146,6 +146,22 @@ def test_messages_say_that_there_is_no_fix():
     assert len(on) == len(set(on)) > 20
 
 
+def test_positions_may_bear_the_stamp_of_the_last_fix():
+    options = perfect(Options(), "ins")
+    stamps = {}
+    for name in ("built", "fix"):
+        asked = replace(options, link=replace(options.link, position_stamp=name, position_hz=25.0))
+        flight = flown(6.0)
+        frames = Autopilot(Ins(flight, asked.ins, 2), clocks(asked.clocks), asked, Origin(), 2).between(0.0, 6.0, 0)
+        messages = [ardupilotmega.MAVLink(None).parse_buffer(f.data)[0] for f in frames]
+        stamps[name] = np.array([m.time_boot_ms for m in messages if m.get_type() == "GLOBAL_POSITION_INT"])
+    age_ms = stamps["built"] - stamps["fix"]
+    # fixes come in five times a second; several positions share one
+    assert age_ms.min() >= 0
+    assert 100 < age_ms.max() <= 201
+    assert len(set(stamps["fix"].tolist())) == pytest.approx(30, abs=2)
+
+
 def test_the_truth_states_what_was_drawn(tmp_path):
     options = replace(
         Options(),
