@@ -19,6 +19,9 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 _SAME_EPOCH_NS: Final = 2_000_000
+WITNESS_WINDOW_NS: Final = 10 * NS_PER_S
+_DOUBLED: Final = 4.0
+"""What doubles a sigma: code has multipath, which its sigma knows nothing of."""
 _CHI2_999: Final = 16.266
 """99.9 % of the squared distance in three dimensions, in units of its covariance."""
 
@@ -74,6 +77,48 @@ def combined(forward: Solution, backward: Solution, shortest_fix_s: float) -> Co
     others[first] = False
     parts = [merged.solution, forward.rows(others), backward.rows(alone)]
     return dataclasses.replace(merged, solution=_joined(parts))
+
+
+def refuted(solution: Solution, witness: Solution) -> tuple[Solution, int]:
+    """Carrier-phase positions that the code alone contradicts, put to where the code has them; and how many.
+
+    A receiver that slips by whole cycles without noticing it leads a filter of carrier phases astray by tens of metres, with sigmas
+    of a few. The code cannot drift: where the difference of the two, averaged over `WITNESS_WINDOW_NS`, is outside 99.9 % of what their
+    covariances for one epoch allow, or that of one epoch is twice as far outside, or the filter itself knows less than the code, the
+    position becomes the code's, with twice its sigma. Differences of less than some metres pass.
+
+    Parameters
+    ----------
+    solution : Solution
+    witness : Solution
+        Of the same observations, from code alone, corrected by the base.
+    """
+    first, second = _pairs(solution, witness)
+    if not len(first):
+        return solution, 0
+    ours, theirs = solution.rows(first), witness.rows(second)
+    d = _towards(ours, theirs)
+    c = ours.covariance_m2 + theirs.covariance_m2 + np.eye(3) * 1e-8
+    begin = np.searchsorted(ours.time_ns, ours.time_ns - WITNESS_WINDOW_NS // 2)
+    end = np.searchsorted(ours.time_ns, ours.time_ns + WITNESS_WINDOW_NS // 2, side="right")
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(d, axis=0)])
+    mean = (total[end] - total[begin]) / (end - begin)[:, None]
+    apart, at_once = (np.einsum("ni,ni->n", v, np.linalg.solve(c, v[..., None])[..., 0]) for v in (mean, d))
+    lost = np.einsum("nii->n", ours.covariance_m2) > _DOUBLED * np.einsum("nii->n", theirs.covariance_m2)
+    wrong = ((apart > _CHI2_999) | (at_once > _DOUBLED * _CHI2_999) | lost) & np.isin(
+        ours.quality, (Quality.FIX, Quality.FLOAT)
+    )
+    if not wrong.any():
+        return solution, 0
+    changed = {name: getattr(solution, name).copy() for name in _REPLACED}
+    for name, values in changed.items():
+        values[first[wrong]] = getattr(theirs, name)[wrong]
+    changed["covariance_m2"][first[wrong]] *= _DOUBLED
+    changed["quality"][first[wrong]] = Quality.DGPS
+    return dataclasses.replace(solution, **changed), int(wrong.sum())
+
+
+_REPLACED: Final = ("latitude_deg", "longitude_deg", "height_m", "covariance_m2", "quality")
 
 
 def _pairs(forward: Solution, backward: Solution) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

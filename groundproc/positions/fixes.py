@@ -13,6 +13,7 @@ from flightlog.errors import LogError, UsageError
 from flightlog.mount import Mount
 from groundproc.geodesy import LocalFrame
 from groundproc.positions.ellipsoid import mat_ecef_enu, turned
+from groundproc.positions.scales import first_of_each
 from groundproc.positions.solution import ELLIPSOID, INS, MSL, Quality, Solution, diagonal_covariance
 
 Array = npt.NDArray[np.float64]
@@ -114,6 +115,7 @@ def outside_fixes(
     sigma_m: Sequence[float] | None = None,
     sigma_scale: float = 1.0,
     qualities: Sequence[Quality] = USED,
+    interval_s: float = 0.0,
 ) -> OutsideFixes:
     """Positions of a solution in a local frame.
 
@@ -134,6 +136,9 @@ def outside_fixes(
         Times all stated sigmas: formal sigmas know nothing of multipath.
     qualities : sequence of Quality
         Which positions are taken.
+    interval_s : float
+        One position of each such interval [s]. The errors of a smoothed trajectory hang together for seconds: a filter that takes 200 of
+        them a second as independent believes 14 times too much.
 
     Raises
     ------
@@ -150,6 +155,10 @@ def outside_fixes(
         names = ", ".join(kind.name.lower() for kind in qualities)
         raise LogError(f"{solution.source}: none of its {len(solution)} positions is of quality {names}")
     chosen = solution.rows(wanted)
+    if interval_s > 0:
+        rows = first_of_each(chosen.time_ns * 1e-9, interval_s)
+        left_out["thinned"] = len(chosen) - len(rows)
+        chosen = chosen.rows(rows)
     height_m = _heights(chosen, height, undulation_m)
     mat_frame_place = _mat_frame_place(frame, chosen)
     velocity, attitude = chosen.velocity_m_s, chosen.quat_place_ins_wxyz

@@ -25,7 +25,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import SourceError, SwathError, UsageError
 from groundproc.files import written_aside
 from groundproc.positions import rinex
-from groundproc.positions.combine import Combined, combined
+from groundproc.positions.combine import Combined, combined, refuted
 from groundproc.positions.ellipsoid import ecef_from_geodetic, geodetic_from_ecef
 from groundproc.positions.rtklib import read_pos, write_pos
 from groundproc.positions.solution import Quality, Solution
@@ -212,11 +212,12 @@ def process(
         inputs = _prepared(rover, base, navigation, folder)
         seen, base_seen, notes = _checked(inputs, where)
         directions = ("forward", "backward") if options.direction == "combined" else (options.direction,)
-        runs = _solve(inputs, folder, directions, options.lines(where), seen, advance)
+        *runs, witness = _solve(inputs, folder, directions, options.lines(where), seen, advance)
         both = combined(runs[0], runs[1], options.shortest_fix_s) if len(runs) == 2 else Combined(runs[0], 0, 0, 0)
-        solution = replace(both.solution, source=output.name)
+        solution, wrong = refuted(both.solution, witness)
+        solution = replace(solution, source=output.name)
         inputs_named = [item.name for item in inputs]
-        summary = _summary(both, solution, seen, base_seen, where, options, notes)
+        summary = _summary(both, wrong, solution, seen, base_seen, where, options, notes)
         with written_aside(output) as aside, aside.open("w", encoding="ascii", newline="\n") as file:
             write_pos(file, solution, _comments(solution, inputs_named, options, where))
     return Processed(solution, summary)
@@ -379,18 +380,20 @@ def _solve(
     seen: rinex.Observations,
     advance: Advance | None,
 ) -> list[Solution]:
-    """A solution of each direction; they run side by side."""
+    """A solution of each direction, and one of the code alone that bears witness; they run side by side."""
+    code = [line for line in lines if not line.startswith(("pos1-posmode", "pos2-armode"))]
+    runs = {direction: [*lines, f"{'pos1-soltype':<18}={direction}"] for direction in directions}
+    runs["code"] = [*code, f"{'pos1-posmode':<18}=dgps", f"{'pos1-soltype':<18}=forward"]
     commands = []
-    for direction in directions:
-        settings = folder / f"{direction}.conf"
-        settings.write_text("\n".join([*lines, f"{'pos1-soltype':<18}={direction}", ""]), encoding="ascii")
+    for name, settings in runs.items():
+        (folder / f"{name}.conf").write_text("\n".join([*settings, ""]), encoding="ascii")
         files = [item.path.name for item in inputs]
-        commands.append([_tool(SOLVER), "-k", settings.name, "-o", f"{direction}.pos", *files])
-    share = None if advance is None else _Share(seen, len(commands), advance)
+        commands.append([_tool(SOLVER), "-k", f"{name}.conf", "-o", f"{name}.pos", *files])
+    share = None if advance is None else _Share(seen, list(runs), advance)
     messages = _run(commands, folder, share)
     found = []
-    for direction, message in zip(directions, messages, strict=True):
-        made = folder / f"{direction}.pos"
+    for name, message in zip(runs, messages, strict=True):
+        made = folder / f"{name}.pos"
         if not made.is_file() or not made.stat().st_size:
             raise PpkError(f"{inputs[0].name}: RTKLIB made no solution ({message or 'it does not say why'})")
         try:
@@ -405,18 +408,18 @@ def _solve(
 class _Share:
     """Turns the epochs that RTKLIB says it processes into shares of the whole work."""
 
-    def __init__(self, seen: rinex.Observations, runs: int, advance: Advance) -> None:
+    def __init__(self, seen: rinex.Observations, runs: Sequence[str], advance: Advance) -> None:
         self._seen, self._runs, self._advance = seen, runs, advance
         self._lock = threading.Lock()
-        self._done = [0.0] * runs
+        self._done = [0.0] * len(runs)
 
     def __call__(self, run: int, time_ns: int) -> None:
         """A run is at an epoch [ns]; a backward one counts from the end."""
         passed = (time_ns - self._seen.start_ns) / max(self._seen.end_ns - self._seen.start_ns, 1)
-        part = min(max(1.0 - passed if run == 1 else passed, 0.0), 1.0)
+        part = min(max(1.0 - passed if self._runs[run] == "backward" else passed, 0.0), 1.0)
         with self._lock:
             if part > self._done[run]:
-                self._advance((part - self._done[run]) / self._runs)
+                self._advance((part - self._done[run]) / len(self._runs))
                 self._done[run] = part
 
 
@@ -500,6 +503,7 @@ def _comments(solution: Solution, inputs: Sequence[str], options: PpkOptions, wh
 
 def _summary(
     both: Combined,
+    wrong: int,
     solution: Solution,
     seen: rinex.Observations,
     base_seen: rinex.Observations,
@@ -517,6 +521,10 @@ def _summary(
         )
     if where.averaged and where.position is None:
         notes.append("the base's own position is known to metres only, and so is everything here, in one piece")
+    if wrong:
+        notes.append(
+            f"{wrong} positions were metres away from what the code says, and are the code's now: does the receiver report its cycle slips?"
+        )
     if not (solution.quality == Quality.FIX).any():
         notes.append("no position is fixed: decimetres at best")
     return {
@@ -528,6 +536,7 @@ def _summary(
         "quality": {name: round(value, 4) for name, value in solution.shares().items()},
         "sigma_m": _sigmas(solution),
         "directions": {"agreed": both.agreed, "contradicted": both.contradicted, "unsupported": both.unsupported},
+        "refuted_by_code": wrong,
         "baseline_m": {
             "shortest": _rounded(length.min()),
             "median": _rounded(np.median(length)),

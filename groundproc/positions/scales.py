@@ -1,6 +1,6 @@
 """Time scales of outside files, for whole columns."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,3 +26,10 @@ def utc_from_gps_calendar(time_ns: Times) -> Times:
 def gps_calendar_from_utc(utc_ns: Times) -> Times:
     """The inverse: Unix time plus the leap seconds so far [ns], shape (n,)."""
     return np.asarray(utc_ns + np.searchsorted(_LEAPS_NS, utc_ns, side="right") * NS_PER_S)
+
+
+def first_of_each(time_s: npt.NDArray[np.floating[Any]], interval_s: float) -> npt.NDArray[np.int64]:
+    """Indices of the first of each interval among times in order [s], shape (n,)."""
+    with np.errstate(invalid="ignore"):
+        number = np.floor(np.asarray(time_s) / interval_s + 1e-6)  # a stamp on the edge belongs behind it
+        return np.flatnonzero(np.concatenate([[True], np.diff(number) != 0]))

@@ -157,13 +157,15 @@ class Receiver:
     clock_s: Array
     place_m: Array
     """True antenna positions, ECEF, at `true_tow_s`."""
+    slipped: npt.NDArray[np.bool_]
+    """Where the receiver noticed that it lost count of cycles, shape (n, satellites)."""
 
     @property
     def true_tow_s(self) -> Array:
         return self.tow_s - self.clock_s
 
     def part(self, chosen: slice) -> "Receiver":
-        names = ("tow_s", "code_m", "phase_cycles", "doppler_hz", "clock_s", "place_m")
+        names = ("tow_s", "code_m", "phase_cycles", "doppler_hz", "clock_s", "place_m", "slipped")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
 
@@ -189,6 +191,15 @@ def _troposphere_m(place: Array, sine: Array) -> Array:
     return np.asarray(0.0022768 * pressure[:, None] * 1.001 / np.sqrt(0.002001 + np.maximum(sine, 0.05) ** 2))
 
 
+def _gauss_markov(rng: np.random.Generator, time_s: Array, tau_s: float, count: int) -> Array:
+    """Unit first-order Gauss-Markov processes, shape (n, count)."""
+    found = rng.normal(size=(len(time_s), count))
+    for k in range(1, len(time_s)):
+        kept = np.exp(-(time_s[k] - time_s[k - 1]) / tau_s)
+        found[k] = kept * found[k - 1] + np.sqrt(1 - kept**2) * found[k]
+    return found
+
+
 def measure(
     orbits: Orbits,
     path: Path3,
@@ -200,10 +211,15 @@ def measure(
     phase_sigma_m: float = 0.003,
     doppler_sigma_m_s: float = 0.03,
     mask_deg: float = 8.0,
+    multipath: tuple[float, float, float] = (0.0, 0.0, 20.0),
+    slips_each_s: float = 0.0,
+    slips_noticed: bool = True,
 ) -> Receiver:
     """Observations at a receiver's own epochs; its clock is off by clock[0] + clock[1] * (time since the first epoch).
 
-    White noise grows with low elevation: sigma^2 = s^2 (1 + 1 / sin^2), as RTKLIB's model has it.
+    White noise grows with low elevation: sigma^2 = s^2 (1 + 1 / sin^2), as RTKLIB's model has it. `multipath` is code [m], phase [m] and
+    correlation time [s] of errors that hang together, which RTKLIB knows nothing of; `slips_each_s` is how often a satellite slips by
+    whole cycles, and the receiver notices it or not.
     """
     rng = np.random.default_rng(seed)
 
@@ -231,10 +247,14 @@ def measure(
     code = full + code_sigma_m * scale * rng.normal(size=full.shape)
     cycles = rng.integers(-50_000, 50_000, len(orbits.prn))
     phase = (full + phase_sigma_m * scale * rng.normal(size=full.shape)) / LAMBDA_M + cycles
+    code += multipath[0] * scale * _gauss_markov(rng, tow_s, multipath[2], len(orbits.prn))
+    phase += multipath[1] / LAMBDA_M * scale * _gauss_markov(rng, tow_s, multipath[2], len(orbits.prn))
+    slipped = rng.random(full.shape) < slips_each_s * float(np.median(np.diff(tow_s)))
+    phase += np.cumsum(np.where(slipped, rng.integers(1, 20, full.shape), 0), axis=0)
     rate += doppler_sigma_m_s * scale * rng.normal(size=full.shape)
     hidden = sine < np.sin(np.deg2rad(mask_deg))
     values = [np.where(hidden, np.nan, v) for v in (code, phase, -rate / LAMBDA_M)]
-    return Receiver(orbits.week, tow_s, orbits.prn, *values, error_s, place)
+    return Receiver(orbits.week, tow_s, orbits.prn, *values, error_s, place, slipped & slips_noticed)
 
 
 def _epoch(week: int, tow_s: float) -> tuple[datetime, str]:
@@ -276,9 +296,10 @@ def write_observations(
 def _epoch_lines(receiver: Receiver, k: int, version: str) -> list[str]:
     seen = np.flatnonzero(np.isfinite(receiver.code_m[k]))
     moment, seconds = _epoch(receiver.week, float(receiver.tow_s[k]))
+    lost = ["1" if receiver.slipped[k, s] else " " for s in seen]
     values = [
-        f"{receiver.code_m[k, s]:14.3f}  {receiver.phase_cycles[k, s]:14.3f}  {receiver.doppler_hz[k, s]:14.3f}  \n"
-        for s in seen
+        f"{receiver.code_m[k, s]:14.3f}  {receiver.phase_cycles[k, s]:14.3f}{mark} {receiver.doppler_hz[k, s]:14.3f}  \n"
+        for s, mark in zip(seen, lost, strict=True)
     ]
     names = [f"G{receiver.prn[s]:02d}" for s in seen]
     if version.startswith("3"):
@@ -329,7 +350,7 @@ def write_ubx(path: Path, receiver: Receiver) -> None:
                 body += struct.pack(
                     "<ddfBBBBHBBBBBx",
                     receiver.code_m[k, s], receiver.phase_cycles[k, s], receiver.doppler_hz[k, s],
-                    0, int(receiver.prn[s]), 0, 0, 64000, 45, 3, 1, 4, 7,
+                    0, int(receiver.prn[s]), 0, 0, 0 if receiver.slipped[k, s] else 64000, 45, 3, 1, 4, 7,
                 )  # fmt: skip
             file.write(ubx_frame(0x02, 0x15, body))
 

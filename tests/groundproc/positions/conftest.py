@@ -5,6 +5,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gnss
 import numpy as np
@@ -54,12 +55,12 @@ class World:
 
 
 @pytest.fixture(scope="session")
-def make_world(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], World]:
-    def make(seed: int) -> World:
+def make_world(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., World]:
+    def make(seed: int, **worse: Any) -> World:
         world = World(tmp_path_factory.mktemp(f"gnss{seed}"), None)  # type: ignore[arg-type]
         orbits = gnss.constellation(WEEK, START_S, seed)
         times_s = START_S + np.arange(0, 60, 0.2)
-        rover = gnss.measure(orbits, world.place_m, times_s, seed=seed + 100, clock=(3.1e-4, 2e-7))
+        rover = gnss.measure(orbits, world.place_m, times_s, seed=seed + 100, clock=(3.1e-4, 2e-7), **worse)
         still = lambda t: np.broadcast_to(world.base_m, (len(t), 3))  # noqa: E731
         base = gnss.measure(orbits, still, START_S - 10 + np.arange(0, 80.0), seed=seed + 200, clock=(-1e-4, -1e-7))
         folder = world.folder
@@ -78,7 +79,7 @@ def make_world(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Worl
 
 
 @pytest.fixture(scope="session")
-def world(make_world: Callable[[int], World]) -> World:
+def world(make_world: Callable[..., World]) -> World:
     return make_world(1)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from groundproc.positions.combine import combined
+from groundproc.positions.combine import combined, refuted
 from groundproc.positions.solution import Quality, Solution, diagonal_covariance
 
 METRE_DEG = 1 / 111_200.0  # of latitude, about
@@ -113,3 +113,36 @@ def test_the_better_kind_wins_and_epochs_of_one_run_stay() -> None:
 def test_runs_that_share_no_epoch_are_put_together() -> None:
     found = combined(track([1]), replace(track([1]), time_ns=np.array([5 * 10**9])), LASTING).solution
     assert found.time_ns.tolist() == [0, 5 * 10**9]
+
+
+def test_what_the_code_contradicts_is_put_to_where_the_code_has_it() -> None:
+    code = track([4] * 40, 0.5, 1.0)
+    drift = np.concatenate([np.zeros(20), np.full(20, 30.0)])
+    astray = track([1] * 20 + [2] * 20, 0.0, 0.05)
+    astray = replace(astray, latitude_deg=astray.latitude_deg + drift * METRE_DEG)
+    found, number = refuted(astray, code)
+    # over a window of 10 s the step is seen up to 5 s too early
+    assert 20 <= number <= 25
+    assert (found.quality[:15] == Quality.FIX).all()
+    assert (found.quality[20:] == Quality.DGPS).all()
+    np.testing.assert_allclose(north_m(found)[20:], 0.5, atol=1e-3)
+    np.testing.assert_allclose(found.sigma_m[20:], 2.0)
+    assert astray.quality[30] == Quality.FLOAT
+
+
+def test_one_epoch_far_off_and_a_lost_filter_are_refuted_too() -> None:
+    code = track([4] * 40, 0.0, 1.0)
+    spike = track([2] * 40, 0.0, 0.05)
+    spike.latitude_deg[20] += 20 * METRE_DEG
+    found, number = refuted(spike, code)
+    assert number == 1
+    assert found.quality[20] == Quality.DGPS
+    lost = track([2] * 40, 1.0, np.where(np.arange(40) < 30, 0.1, 20.0))
+    assert refuted(lost, code)[0].quality.tolist() == [2] * 30 + [4] * 10
+
+
+def test_metres_of_multipath_and_times_without_witness_refute_nothing() -> None:
+    fixes = track([1] * 40)
+    assert refuted(fixes, track([4] * 40, 2.0, 1.0)) == (fixes, 0)
+    elsewhere = replace(track([4] * 40, 50.0, 1.0), time_ns=np.arange(40) * 10**9 + 10**15)
+    assert refuted(fixes, elsewhere) == (fixes, 0)

@@ -125,6 +125,9 @@ def test_qualities_and_times_are_chosen_and_counted() -> None:
     assert fixed.left_out == {"damaged": 2, "other_quality": 2}
     with pytest.raises(LogError, match="none of its 5 positions is of quality ppp"):
         outside_fixes(solution(), FRAME, np.zeros(3), qualities=(Quality.PPP,))
+    thin = outside_fixes(solution(), FRAME, np.zeros(3), interval_s=2.0)
+    assert thin.time_ns.tolist() == [0, 2 * 10**9, 4 * 10**9]
+    assert thin.left_out == {"thinned": 2}
     part = outside_fixes(solution(), FRAME, np.zeros(3)).between(10**9, 3 * 10**9)
     assert part.time_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
     assert len(part.position_m) == 3

@@ -1,5 +1,6 @@
 """Every format is told by its content, and what is none of them is named."""
 
+import random
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flightlog.errors import LogError
+from flightlog.errors import LogError, SwathError
 from groundproc.geodesy import LocalFrame
 from groundproc.positions.reading import read_solution
 from groundproc.trajectory.table import from_poses, write_trajectory
@@ -73,6 +74,29 @@ def test_each_format_is_told_by_its_content(write: Callable[[bytes], Path]) -> N
 def test_what_is_no_solution_is_named(write: Callable[[bytes], Path], content: bytes, sentence: str) -> None:
     with pytest.raises(LogError, match=sentence):
         read_solution(write(content))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damage_is_a_sentence_or_a_count_and_never_a_traceback(write: Callable[[bytes], Path], seed: int) -> None:
+    rng = random.Random(seed)
+    rows = "".join(POS.splitlines()[1].replace("302400.2", f"{302400 + k}") + "\n" for k in range(10))
+    for content in (POS.encode() + rows.encode(), NMEA * 3, POSES.format(cross=0).encode(), sbet(30)):
+        for _ in range(60):
+            damaged = bytearray(content)
+            for _ in range(rng.choice((1, 3, 10, 50))):
+                place = rng.randrange(len(damaged))
+                if rng.random() < 0.7:
+                    damaged[place] = rng.choice((rng.randrange(256), *b"0123456789.-e,:/% \n'*$"))
+                else:
+                    del damaged[place : place + rng.choice((1, 2, 10, 100))]
+                damaged = damaged or bytearray(b"x")
+            try:
+                found = read_solution(write(bytes(damaged)), near_utc_ns=1_707_307_200 * 10**9)
+            except SwathError as error:
+                assert "\n" not in str(error)
+            else:
+                assert (np.diff(found.time_ns) > 0).all()
+                assert (np.abs(found.latitude_deg) <= 90).all()
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

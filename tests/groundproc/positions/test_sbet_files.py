@@ -91,6 +91,18 @@ def test_the_week_comes_from_the_user_or_the_flight(write: Callable[..., Path]) 
     assert utc.time_ns[0] - truth == 18 * 10**9
 
 
+def test_records_that_cannot_be_are_left_out_and_others_thinned(write: Callable[..., Path]) -> None:
+    rows = records()
+    rows[7] = (rows[7][0], np.nan, *rows[7][2:])
+    rows[9] = (*rows[9][:3], 1e300, *rows[9][4:])
+    found = read_sbet(write(rows), week=WEEK)
+    assert len(found) == 398
+    assert found.left_out == {"damaged": 2}
+    thin = read_sbet(write(records()), week=WEEK, interval_s=0.1)
+    assert np.diff(thin.time_ns).tolist() == [100_000_000] * 19
+    assert thin.velocity_m_s is not None
+
+
 def test_the_end_of_the_week_is_passed(write: Callable[..., Path]) -> None:
     found = read_sbet(write(records(start_s=604_799.0)), week=WEEK)
     assert np.diff(found.time_ns).tolist() == [5_000_000] * 399
