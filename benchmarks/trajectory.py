@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,13 +91,14 @@ class Made:
     other_load: float
     """Cores that other programs took meanwhile."""
     warning: str = ""
+    report: dict[str, Any] = field(default_factory=dict)
 
 
 def own_methods() -> list[str]:
     """What `swath process --method` offers, and the causal mode of the last where there is one."""
-    (choice,) = (field for field in fields(Survey) if field.name == "method")
+    (choice,) = (each for each in fields(Survey) if each.name == "method")
     names = list(choice.metadata["choices"])
-    return [*names, "adjusted_causal"] if "causal" in {field.name for field in fields(Survey)} else names
+    return [*names, "adjusted_causal"] if "causal" in {each.name for each in fields(Survey)} else names
 
 
 def peers() -> list[str]:
@@ -156,7 +157,7 @@ def _method(name: str, truth: Truth, reader: LogReader) -> Made:
     if len({leg.run for leg in timeline}) > 1:
         raise SystemExit(f"{reader.path}: the lidar's clock was set in flight, expected one run of it")
     placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
-    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning)
+    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning, estimate.report)
 
 
 def _odometry(name: str, truth: Truth, reader: LogReader) -> Made:
@@ -195,7 +196,8 @@ def one(name: str, folder: Path, results: Path, section: Section | None) -> None
             "other_load": made.other_load,
         }
     figures |= {"warning": made.warning} if made.warning else {}
-    (results / f"{name}.json").write_text(json.dumps(found.figures | figures, indent=1) + "\n")
+    figures |= {"report": made.report} if made.report else {}
+    (results / f"{name}.json").write_text(json.dumps(found.figures | figures, indent=1, default=float) + "\n")
     np.savez_compressed(results / f"{name}.npz", **found.courses)
 
 

@@ -101,17 +101,16 @@ class Moments:
         """Points in each group, shape (groups,)."""
         return np.asarray(self._sums[: len(self), 0, 0].astype(np.int64))
 
-    def extents_m(self, number: int) -> Array:
-        """Standard deviations of the points of a set along the axes of each group, smallest first, shape (groups, 3)."""
+    def covariances(self, number: int) -> Array:
+        """Covariance of the points of a set in each group [m^2], shape (groups, 3, 3)."""
         sums = self._sums[: len(self), number]
         count = np.maximum(sums[:, 0], 1.0)
         mean = sums[:, 1:4] / count[:, None]
         xx, xy, xz, yy, yz, zz = (sums[:, 4:] / count[:, None]).T
         second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-        covariance = second - mean[:, :, None] * mean[:, None, :]
         # a plane takes three degrees of freedom
-        covariance *= (count / np.maximum(count - 3.0, 1.0))[:, None, None]
-        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0)))
+        scale = (count / np.maximum(count - 3.0, 1.0))[:, None, None]
+        return np.asarray(scale * (second - mean[:, :, None] * mean[:, None, :]))
 
 
 @njit(cache=True, nogil=True)
@@ -136,19 +135,34 @@ HITS, ESTIMATED, FLOOR = range(3)
 """The sets of points of `flat_patches`."""
 
 
+def _walls(moments: Moments) -> tuple[npt.NDArray[np.bool_], Array]:
+    """Which groups are patches of a flat wall, by their true echoes, and axes of each group as columns: out of the wall, and in it."""
+    spread, axes = np.linalg.eigh(moments.covariances(HITS))
+    extents = np.sqrt(np.maximum(spread, 0.0))
+    flat = (moments.counts() >= LEAST_POINTS) & (extents[:, 0] <= LARGEST_RELIEF_M) & (extents[:, 1] >= LEAST_EXTENT_M)
+    return flat, axes
+
+
 def flat_patches(moments: Moments) -> npt.NDArray[np.bool_]:
-    """Which groups are patches of a flat wall, by their true echoes, shape (groups,)."""
-    if not len(moments):
-        return np.zeros(0, np.bool_)
-    extents = moments.extents_m(HITS)
-    return np.asarray(
-        (moments.counts() >= LEAST_POINTS) & (extents[:, 0] <= LARGEST_RELIEF_M) & (extents[:, 1] >= LEAST_EXTENT_M)
-    )
+    """Which groups are patches of a flat wall, shape (groups,)."""
+    return _walls(moments)[0] if len(moments) else np.zeros(0, np.bool_)
 
 
 def thickness_m(moments: Moments, number: int) -> Array:
-    """Thickness of each flat patch in a set, shape (patches,)."""
-    return np.asarray(moments.extents_m(number)[flat_patches(moments), 0]) if len(moments) else np.zeros(0)
+    """Thickness of each flat patch in a set, shape (patches,): standard deviation about the plane fitted to its points.
+
+    The plane is that of the least squares of distances out of the true wall over places in it, and so always a wall's. The thinnest
+    direction of the points would not do: of a patch that is smeared over metres it lies in the wall, and says half a metre for ever.
+    """
+    if not len(moments):
+        return np.zeros(0)
+    flat, axes = _walls(moments)
+    axes = axes[flat]
+    covariance = np.swapaxes(axes, 1, 2) @ moments.covariances(number)[flat] @ axes
+    across, inside = covariance[:, 1:, :1], covariance[:, 1:, 1:]
+    slope = np.linalg.solve(inside, across) if len(inside) else across
+    left = covariance[:, 0, 0] - (slope * across).sum(axis=(1, 2))
+    return np.asarray(np.sqrt(np.maximum(left / (1.0 + np.square(slope).sum(axis=(1, 2))), 0.0)))
 
 
 def trimmed_mean(values: Array) -> float:

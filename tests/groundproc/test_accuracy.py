@@ -327,13 +327,27 @@ def test_thickness_of_one_sheet_and_of_two() -> None:
     assert patches.trimmed_mean(patches.thickness_m(moments, 2)) == pytest.approx(np.hypot(0.01, 0.03), rel=spread)
 
 
-def test_thickness_does_not_mind_where_the_wall_stands() -> None:
+@pytest.mark.parametrize("turn_deg", [2.0, 10.0])
+def test_thickness_does_not_mind_where_the_wall_stands(turn_deg: float) -> None:
     rng, moments = np.random.default_rng(7), Moments(3)
     hits, normals = wall(rng, 20_000)
     noisy = hits + rng.normal(scale=0.01, size=(len(hits), 1)) * normals
-    elsewhere = Rotation.from_rotvec([0.2, -0.3, 1.0]).apply(noisy) + np.array([500.0, 900.0, 40.0])
+    elsewhere = Rotation.from_euler("zx", [turn_deg, -turn_deg], degrees=True).apply(noisy) + np.array(
+        [500.0, 900.0, 40.0]
+    )
     moments.add(patch_keys(hits, normals, np.zeros(len(hits), np.int64)), hits, hits, noisy, elsewhere)
-    np.testing.assert_allclose(patches.thickness_m(moments, 2), patches.thickness_m(moments, 1), rtol=1e-5)
+    # the noise turns with the wall and so has a part in the fit's own abscissae: (10 mm * sin 10 deg / 0.58 m)^2 is nothing
+    np.testing.assert_allclose(patches.thickness_m(moments, 2), patches.thickness_m(moments, 1), rtol=1e-4)
+
+
+def test_a_wall_smeared_over_metres_is_metres_thick() -> None:
+    rng, moments = np.random.default_rng(11), Moments(3)
+    hits, normals = wall(rng, 20_000)
+    smeared = hits + rng.normal(scale=4.0, size=(len(hits), 1)) * normals
+    moments.add(patch_keys(hits, normals, np.zeros(len(hits), np.int64)), hits, hits, smeared, hits)
+    # a slope that the smear shows by chance counts as one: that is some percent
+    assert patches.trimmed_mean(patches.thickness_m(moments, 1)) == pytest.approx(4.0, rel=0.15)
+    assert patches.trimmed_mean(patches.thickness_m(moments, 2)) < 1e-6
 
 
 def test_what_is_not_flat_is_no_patch() -> None:
