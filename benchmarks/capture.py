@@ -294,7 +294,7 @@ def run_tcpdump(folder: Path, rate: float, seconds: float) -> Run | None:
         return None
     port = free_port()
     pcap = folder / "tcpdump.pcap"
-    command = [program, "-i", "lo", "-B", "8192", "-w", str(pcap), "udp", "and", "dst", "port", str(port)]
+    command = [program, "-i", "lo", "-B", "9216", "-w", str(pcap), "udp", "and", "dst", "port", str(port)]
     if os.geteuid() == 0:
         command[1:1] = ["-Z", "root"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
@@ -340,7 +340,7 @@ def bare_main(options: argparse.Namespace) -> None:
         running = False
 
     signal.signal(signal.SIGTERM, stop)
-    sock = open_udp(ADDRESS, options.port, 8 << 20)
+    sock = open_udp(ADDRESS, options.port, 9 << 20)
     slots = np.zeros(1024, records.SCAN_PACKET_DTYPE)
     receiver = Receiver(sock, slots, 8, hdl32e.DATA_BYTES)
     content, size = slots.view(np.uint8).data, slots.dtype.itemsize
@@ -368,7 +368,7 @@ def recvfrom_main(options: argparse.Namespace) -> None:
 
     signal.signal(signal.SIGTERM, stop)
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 9 << 20)
     sock.bind((ADDRESS, options.port))
     sock.settimeout(0.2)
     with options.recvfrom.open("wb") as file:

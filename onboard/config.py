@@ -30,7 +30,7 @@ class LidarConfig:
     data_port: int = option(HDL32E_DATA_PORT, "port of the data packets", minimum=1, maximum=65535)
     position_port: int = option(HDL32E_POSITION_PORT, "port of the position packets", minimum=1, maximum=65535)
     receive_buffer_kb: int = option(
-        8192, "kernel receive buffer; 8192 bridges a stall of 4 s [kB]", minimum=16, maximum=262144
+        9216, "kernel receive buffer; 9216 bridges a stall of 4 s [kB]", minimum=16, maximum=262144
     )
     poll_ms: int = option(
         240, "longest pause between two looks at the sockets, 100 with a downlink; receive times are the kernel's [ms]",

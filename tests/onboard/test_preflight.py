@@ -113,8 +113,8 @@ def test_a_directory_that_cannot_be_written_and_a_full_disk_are_critical(tmp_pat
 def test_a_small_receive_buffer_comes_with_the_setting_that_helps(tmp_path: Path) -> None:
     (tmp_path / "rmem_max").write_text("212992\n")
     item = check_buffer(LidarConfig(), tmp_path / "rmem_max")
-    assert (item.level, item.found) == (Level.WARNING, "208 kB of the 8192 kB asked for")
-    assert item.remedy == "sysctl -w net.core.rmem_max=8388608"
+    assert (item.level, item.found) == (Level.WARNING, "208 kB of the 9216 kB asked for")
+    assert item.remedy == "sysctl -w net.core.rmem_max=9437184"
 
 
 @pytest.mark.parametrize(
