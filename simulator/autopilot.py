@@ -193,9 +193,8 @@ class Autopilot:
         usec = m.boot_ns // NS_PER_US
         if self._options.firmware == "3.1.3":  # its micros() has 32 bits
             usec %= _U32
-        heading = m.belief.heading_rad[m.row]
-        field = (round(160 * np.cos(heading)), round(-160 * np.sin(heading)), 480)
-        return ardupilotmega.MAVLink_raw_imu_message(usec, *values.tolist(), *field)
+        field = np.rint(m.belief.field_frd_mgauss[m.row]).astype(int)
+        return ardupilotmega.MAVLink_raw_imu_message(usec, *values.tolist(), *field.tolist())
 
     def _scaled_pressure(self, m: _Moment) -> Any:
         height_m = self._origin.height_msl_m + m.belief.position_m[m.row, 2]

@@ -22,6 +22,8 @@ _STEP_S: Final = 0.1
 _TILT_TAU_S: Final = 8.0
 _POSITION_SMOOTH_S: Final = 1.5
 _MARGIN_S: Final = 10.0
+_FIELD_MGAUSS: Final = np.array([0.0, 160.0, -480.0])
+"""The earth's field at 58 deg north: east, north, up. North is taken for true north."""
 _RECOVERY_S: Final = 2.5
 """Time constant with which the position goes back to the fixes after an outage (AP_InertialNav of ArduCopter 3.1)."""
 
@@ -41,6 +43,7 @@ class Belief:
     Attributes
     ----------
     heading_rad, pitch_rad, roll_rad : shape (n,); the heading is continuous
+    field_frd_mgauss : shape (n, 3), the magnetometer's reading, forward right down
     rates_frd_rad_s, force_frd_m_s2 : shape (n, 3), forward right down
     position_m, velocity_m_s : shape (n, 3), local frame
         Of the GPS antenna where the position is not referred to the IMU.
@@ -49,6 +52,7 @@ class Belief:
     heading_rad: Array
     pitch_rad: Array
     roll_rad: Array
+    field_frd_mgauss: Array
     rates_frd_rad_s: Array
     force_frd_m_s2: Array
     position_m: Array
@@ -177,11 +181,19 @@ class Ins:
             heading_rad=heading,
             pitch_rad=pitch,
             roll_rad=roll,
+            field_frd_mgauss=ins_from_frd(self._field(time_s)),
             rates_frd_rad_s=ins_from_frd(rates),  # its own inverse
             force_frd_m_s2=ins_from_frd(force),
             position_m=position + o.position_noise_m * rng.standard_normal(position.shape),
             velocity_m_s=velocity,
         )
+
+    def _field(self, time_s: Array) -> Array:
+        """What the magnetometer reads in the ins frame, shape (n, 3) [mgauss]: the earth's field turned by the compass error."""
+        poses = self._flight.poses(time_s)
+        heading = poses.heading_rad + self.compass_error_rad(poses.heading_rad)
+        mat = mat_local_ins(heading, poses.pitch_rad, poses.roll_rad)
+        return np.asarray(np.einsum("nij,i->nj", mat, _FIELD_MGAUSS))
 
     def _place(self, time_s: Array) -> tuple[Array, Array]:
         """Position and velocity as believed, without white noise, shape (n, 3) each."""

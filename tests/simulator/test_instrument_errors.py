@@ -146,6 +146,20 @@ def test_messages_say_that_there_is_no_fix():
     assert len(on) == len(set(on)) > 20
 
 
+def test_a_levelled_magnetometer_points_where_the_compass_says():
+    flight = flown()
+    ins, seen = believed(TIME_S, flight=flight, compass_bias_deg=8.0, compass_offset_deg=1.5)
+    poses = flight.poses(TIME_S)
+    # textbook: undo roll about forward, then pitch about right, in forward right down; heading from what is left
+    x, y, z = seen.field_frd_mgauss.T
+    across = y * np.cos(poses.roll_rad) - z * np.sin(poses.roll_rad)
+    below = y * np.sin(poses.roll_rad) + z * np.cos(poses.roll_rad)
+    ahead = x * np.cos(poses.pitch_rad) + below * np.sin(poses.pitch_rad)
+    error = np.arctan2(-across, ahead) - poses.heading_rad - ins.compass_error_rad(poses.heading_rad)
+    assert np.abs((error + np.pi) % (2 * np.pi) - np.pi).max() < 1e-9
+    assert np.linalg.norm(seen.field_frd_mgauss, axis=1) == pytest.approx(np.hypot(160, 480))
+
+
 def test_positions_may_bear_the_stamp_of_the_last_fix():
     options = perfect(Options(), "ins")
     stamps = {}
