@@ -47,6 +47,9 @@ class GyroOptions:
     rotor_line_deg_s: float = option(0.3, "amplitude at the rotor's frequency [deg/s]", minimum=0, maximum=50)
     accel_noise_g: float = option(0.015, "white noise of a sample, one sigma [g]", minimum=0, maximum=2)
     accel_rotor_line_g: float = option(0.04, "amplitude at the rotor's frequency [g]", minimum=0, maximum=2)
+    offset_walk_deg_s: float = option(
+        0.0, "random walk of the zero offsets, one sigma after a minute [deg/s]", minimum=0, maximum=10
+    )
     scale: float = option(
         0.0, "scale factor error of each gyro, one sigma over seeds, relative", minimum=0, maximum=0.5
     )
@@ -124,6 +127,9 @@ class InsOptions:
     gyro_bias_deg_s: float = option(
         0.3, "constant error of each rate, one sigma over seeds [deg/s]", minimum=0, maximum=50
     )
+    gyro_walk_deg_s: float = option(
+        0.0, "random walk of that error, one sigma after a minute [deg/s]", minimum=0, maximum=10
+    )
     gyro_scale: float = option(
         0.0, "scale factor error of each gyro, one sigma over seeds, relative", minimum=0, maximum=0.5
     )
@@ -143,6 +149,9 @@ class InsOptions:
     accel_noise_m_s2: float = option(0.3, "white noise of a specific force, one sigma [m/s^2]", minimum=0, maximum=50)
     accel_bias_m_s2: float = option(
         0.0, "constant error of each specific force, one sigma over seeds [m/s^2]", minimum=0, maximum=10
+    )
+    accel_walk_m_s2: float = option(
+        0.0, "random walk of that error, one sigma after a minute [m/s^2]", minimum=0, maximum=10
     )
     accel_scale: float = option(
         0.0, "scale factor error of each accelerometer, one sigma over seeds, relative", minimum=0, maximum=0.5

@@ -1,4 +1,4 @@
-"""Constant errors of three gyros or three accelerometers: scale, misalignment, bias."""
+"""Errors of three gyros or three accelerometers: scale, misalignment, bias, and a bias that wanders."""
 
 from dataclasses import dataclass
 
@@ -57,3 +57,29 @@ class Triad:
     def read(self, true: Array) -> Array:
         """Readings without noise of true vectors, shape (n, 3)."""
         return np.asarray(true @ self.matrix.T + self.bias)
+
+
+class Wander:
+    """Random walks of three biases, 0 at the start.
+
+    Parameters
+    ----------
+    rng : Generator
+    duration_s : float
+    sigma : float
+        Of each after a minute, in the unit of what is measured; it grows with the root of time.
+    """
+
+    def __init__(self, rng: np.random.Generator, duration_s: float, sigma: float) -> None:
+        steps = rng.standard_normal((int(duration_s) + 2, 3)) * sigma / np.sqrt(60.0)
+        steps[0] = 0.0
+        self._values = np.cumsum(steps, axis=0)
+
+    def at(self, time_s: Array) -> Array:
+        """Values at true times, shape (n, 3); straight from second to second."""
+        grid_s = np.arange(len(self._values))
+        return np.stack([np.interp(time_s, grid_s, column) for column in self._values.T], axis=1)
+
+    def listed(self, every_s: int = 10) -> list[list[float]]:
+        """Values at 0, 10, 20 s and so on, as the truth states them."""
+        return [row.tolist() for row in self._values[::every_s]]

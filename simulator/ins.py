@@ -14,7 +14,7 @@ from simulator.chance import generator
 from simulator.config import InsOptions
 from simulator.faults import Outage
 from simulator.flight import Flight
-from simulator.imu import Triad
+from simulator.imu import Triad, Wander
 
 Array = npt.NDArray[np.float64]
 
@@ -113,6 +113,10 @@ class Ins:
             bias=o.accel_bias_m_s2,
         )
         """Accelerometers in the ins frame [m/s^2]."""
+        self.gyro_wander = Wander(generator(seed, "ins gyro walk"), flight.duration_s, np.radians(o.gyro_walk_deg_s))
+        """On top of the gyros' biases [rad/s]."""
+        self.accel_wander = Wander(generator(seed, "ins accelerometer walk"), flight.duration_s, o.accel_walk_m_s2)
+        """On top of the accelerometers' biases [m/s^2]."""
         if outage is not None and outage.start_s > 0:
             position = self._coasting(time_s, position, outage)
         self._position_error: BSpline = make_interp_spline(time_s, position, k=3)
@@ -128,7 +132,8 @@ class Ins:
         inside = slice(first, last + 1)
         within_s = np.clip(time_s[inside], 0.0, self._flight.duration_s)
         force = self._flight.specific_force_m_s2(within_s)
-        believed = mat_local_ins(*self._angles(within_s)) @ self.accelerometers.read(force)[..., None]
+        read = self.accelerometers.read(force) + self.accel_wander.at(within_s)
+        believed = mat_local_ins(*self._angles(within_s)) @ read[..., None]
         true = self._flight.poses(within_s).mat_local_ins() @ force[..., None]
         start_m_s = (error_m[first] - error_m[first - 1]) / _STEP_S
         velocity = start_m_s + np.cumsum((believed - true)[..., 0], axis=0) * _STEP_S
@@ -171,9 +176,9 @@ class Ins:
         # jitter and delay may point just outside the flight
         time_s = np.clip(time_s - o.gyro_delay_s, 0.0, self._flight.duration_s)
         heading, pitch, roll = self._angles(time_s)
-        rates = self.gyros.read(self._flight.rates_rad_s(time_s, self._gain))
+        rates = self.gyros.read(self._flight.rates_rad_s(time_s, self._gain)) + self.gyro_wander.at(time_s)
         rates = rates + np.radians(o.gyro_noise_deg_s) * rng.standard_normal(rates.shape)
-        force = self.accelerometers.read(self._flight.specific_force_m_s2(time_s))
+        force = self.accelerometers.read(self._flight.specific_force_m_s2(time_s)) + self.accel_wander.at(time_s)
         force = force + o.accel_noise_m_s2 * rng.standard_normal(force.shape)
         place_s = time_s if not o.position_delay_s else np.clip(time_s - o.position_delay_s, 0.0, None)
         position, velocity = self._place(place_s)

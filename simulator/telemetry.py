@@ -26,7 +26,7 @@ from simulator.clocks import Clocks
 from simulator.config import Options
 from simulator.flight import Flight
 from simulator.geodesy import Origin, geodetic
-from simulator.imu import Triad
+from simulator.imu import Triad, Wander
 
 Array = npt.NDArray[np.float64]
 
@@ -77,6 +77,10 @@ class Telemetry:
             bias=np.array(options.gyros.offset_deg_s),
         )
         """Gyro 1, 2, 3 along the axes that the manual's figure gives them [deg/s]."""
+        self.gyro_wander = Wander(
+            generator(seed, "telemetry gyro walk"), flight.duration_s, options.gyros.offset_walk_deg_s
+        )
+        """On top of their zero offsets [deg/s]."""
         self._rotor_hz = options.lidar.rpm / 60.0
         rng = generator(seed, "telemetry times")
         count = int(flight.duration_s / 0.004) + 100
@@ -108,7 +112,7 @@ class Telemetry:
         o = self._options
         turn = 2 * np.pi * self._rotor_hz * time_s[:, None]
         rates = np.degrees(self._flight.rates_rad_s(time_s)) @ self._mat_lidar_ins.T
-        gyros = self.gyros.read(rates @ SENSOR_FROM_GYROS.astype(np.float64))
+        gyros = self.gyros.read(rates @ SENSOR_FROM_GYROS.astype(np.float64)) + self.gyro_wander.at(time_s)
         gyros = gyros + o.noise_deg_s * rng.standard_normal(gyros.shape)
         gyros = gyros + o.rotor_line_deg_s * np.sin(turn + np.array([0.3, 1.9, 3.1]))
         force = self._flight.specific_force_m_s2(time_s, self._lever_m) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2

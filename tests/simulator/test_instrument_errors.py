@@ -14,7 +14,7 @@ from simulator.config import FaultOptions, FlightOptions, InsOptions, MountOptio
 from simulator.faults import Outage
 from simulator.flight import Flight
 from simulator.geodesy import Origin
-from simulator.imu import Triad
+from simulator.imu import Triad, Wander
 from simulator.ins import Ins
 from simulator.render import Job, Simulation
 from simulator.scene import scene
@@ -69,12 +69,33 @@ def test_what_is_drawn_is_what_the_matrix_says_and_of_its_size():
     assert biases.std() == pytest.approx(0.1, rel=0.09)
 
 
+def test_a_bias_that_wanders_grows_with_the_root_of_time_and_is_stated():
+    ends = np.array([Wander(generator(i, "x"), 240.0, 0.1).at(np.array([0.0, 60.0, 240.0])) for i in range(150)])
+    assert (ends[:, 0] == 0).all()
+    # 450 values: the standard deviation is known to 3.3 %; three times that
+    assert ends[:, 1].std() == pytest.approx(0.1, rel=0.1)
+    assert ends[:, 2].std() == pytest.approx(0.2, rel=0.1)
+    flight = flown()
+    _, clean = believed(TIME_S, flight=flight)
+    ins, seen = believed(TIME_S, flight=flight, gyro_walk_deg_s=0.1, accel_walk_m_s2=0.02)
+    stated = np.degrees(ins.gyro_wander.listed())
+    extra = np.degrees(frd(seen.rates_frd_rad_s - clean.rates_frd_rad_s))
+    assert extra[TIME_S.searchsorted(20.0)] == pytest.approx(stated[2], abs=1e-3)
+    assert np.abs(frd(seen.force_frd_m_s2 - clean.force_frd_m_s2)).max() < 0.1
+
+
 def test_perfect_takes_all_of_it_out():
     wrong = replace(
         Options(),
-        ins=InsOptions(gyro_scale=0.01, gyro_scale_fixed=(0.1, 0, 0), accel_bias_m_s2=1.0, position_delay_s=0.2),
+        ins=InsOptions(
+            gyro_scale=0.01,
+            gyro_scale_fixed=(0.1, 0, 0),
+            gyro_walk_deg_s=1.0,
+            accel_bias_m_s2=1.0,
+            position_delay_s=0.2,
+        ),
         lidar=replace(Options().lidar, elevation_error_deg=0.1),
-        gyros=replace(Options().gyros, scale=0.01, misalignment_deg=1.0),
+        gyros=replace(Options().gyros, scale=0.01, misalignment_deg=1.0, offset_walk_deg_s=1.0),
     )
     assert perfect(wrong) == perfect(Options())
 
