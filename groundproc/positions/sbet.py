@@ -84,8 +84,8 @@ def read_sbet(
 ) -> Solution:
     """Read an SBET.
 
-    Velocities are taken with the wander angle undone, or as north and east where that fits the positions better; where neither fits
-    they are left out. Accelerations and rates are not read.
+    Velocities are taken with the wander angle undone, the one way round or the other, or as north and east, whichever fits the
+    positions; where none does they are left out. Accelerations and rates are not read.
 
     Parameters
     ----------
@@ -115,11 +115,11 @@ def read_sbet(
     if not len(records):
         raise LogError(f"{path}: none of its {len(whole)} records holds a place, a velocity and an attitude")
     time_ns = _utc_ns(records["time"], path, near_utc_ns, week, utc_seconds)
-    heading = records["platform_heading"] - records["wander_angle"]
+    speed, sign, note = _velocity(records)
+    heading = records["platform_heading"] - sign * records["wander_angle"]
     quat = frames.quat_from_mat(frames.mat_local_ins(heading, records["pitch"], records["roll"]))
     accuracy = accuracy or _beside(path)
     position, velocity, attitude = _covariances(records["time"], accuracy, path)
-    speed, note = _velocity(records)
     return tidied(
         Solution(
             source=path.name,
@@ -216,25 +216,27 @@ def _covariances(time_s: Array, accuracy: Path | None, path: Path) -> tuple[Arra
     )
 
 
-def _velocity(records: npt.NDArray[np.void]) -> tuple[Array | None, str]:
-    """Velocities east, north, up, shape (n, 3), that agree with the positions, and a sentence where something was decided."""
-    if len(records) < 3:
-        return None, ""
+def _velocity(records: npt.NDArray[np.void]) -> tuple[Array | None, float, str]:
+    """Velocities east, north, up, shape (n, 3), that agree with the positions; the sign of the wander angle; what was decided, in words.
+
+    True heading is platform heading less the wander angle. Whether a file counts the angle the other way round, its velocities tell.
+    """
     x, y, up = records["x_velocity"], records["y_velocity"], -records["z_velocity"]
-    cosine, sine = np.cos(records["wander_angle"]), np.sin(records["wander_angle"])
-    unwound = np.stack([y * cosine - x * sine, x * cosine + y * sine, up], axis=-1)
-    plain = np.stack([y, x, up], axis=-1)
-    for velocity, note in (
-        (unwound, ""),
-        (plain, "velocities are north and east already; the wander angle was not applied"),
-    ):
-        if _agrees(records, velocity):
-            return velocity, note
-    return None, "velocities contradict the positions and were left out"
+    for sign, note in ((1.0, ""), (-1.0, "its wander angle counts the other way round"), (0.0, "")):
+        angle = sign * records["wander_angle"]
+        velocity = np.stack([y * np.cos(angle) - x * np.sin(angle), x * np.cos(angle) + y * np.sin(angle), up], axis=-1)
+        if not _agrees(records, velocity):
+            continue
+        if sign == 0.0:  # the velocities say nothing of the heading
+            return velocity, 1.0, "velocities are north and east already; the wander angle was not applied to them"
+        return velocity, sign, note
+    return None, 1.0, "velocities contradict the positions and were left out"
 
 
 def _agrees(records: npt.NDArray[np.void], velocity: Array) -> bool:
     """Whether velocities, integrated, give the way between positions."""
+    if len(records) < 2:
+        return True
     latitude, longitude = np.rad2deg(records["latitude"]), np.rad2deg(records["longitude"])
     place = ecef_from_geodetic(latitude, longitude, records["altitude"])
     way = np.einsum("nji,nj->ni", mat_ecef_enu(latitude[:-1], longitude[:-1]), np.diff(place, axis=0))

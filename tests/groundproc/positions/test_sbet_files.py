@@ -74,6 +74,14 @@ def test_velocities_are_believed_only_as_far_as_the_positions_bear_them_out(writ
     assert plain.velocity_m_s is not None
     np.testing.assert_allclose(plain.velocity_m_s[0], [5.0, 3.0, 1.0], atol=1e-9)
     assert "wander angle was not applied" in plain.notes[0]
+    # platform heading and velocities of a file that counts the angle the other way round
+    rows = [(*row[:10], -row[10], *row[11:]) for row in records(wander=0.7)]
+    other, usual = read_sbet(write(rows), week=WEEK), read_sbet(write(records(wander=0.7)), week=WEEK)
+    assert "other way round" in other.notes[0]
+    assert usual.notes == ()
+    assert other.quat_place_ins_wxyz is not None
+    assert usual.quat_place_ins_wxyz is not None
+    np.testing.assert_allclose(other.quat_place_ins_wxyz, usual.quat_place_ins_wxyz, atol=1e-12)
     wrong = read_sbet(write(records(lie=4.0)), week=WEEK)
     assert wrong.velocity_m_s is None
     assert "contradict" in wrong.notes[0]
