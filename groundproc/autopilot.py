@@ -40,7 +40,7 @@ _STAMP_OFFSETS: Final = {
 
 _TABLES: Final = (
     "ATTITUDE", "ATTITUDE_QUATERNION", "AHRS2", "RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "HIGHRES_IMU", "GLOBAL_POSITION_INT",
-    "GPS_RAW_INT", "SYSTEM_TIME", "HEARTBEAT",
+    "GPS_RAW_INT", "SYSTEM_TIME", "HEARTBEAT", "SCALED_PRESSURE",
 )  # fmt: skip
 
 WANTED: Final = frozenset(_STAMP_OFFSETS) | frozenset(mavlink.message_id(name) for name in _TABLES)
