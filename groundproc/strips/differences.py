@@ -1,0 +1,181 @@
+"""What overlapping strips differ by: two planes of one voxel, one of each strip, along their normal."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from groundproc.adjustment.rotations import flattest
+from groundproc.strips.clusters import Gatherer
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+LEVEL: Final = 0.94
+"""Planes with a steeper normal than this upward part (20 deg) tell heights; the others tell plan."""
+FEWEST: Final = 8
+"""Points of a strip's plane."""
+_ALIKE: Final = 0.985
+"""Cosine between the normals of two planes that are one surface (10 deg)."""
+_LIMIT: Final = 1_500_000
+"""Voxels of strips that are kept."""
+
+
+class Patches:
+    """Collects the planes of all strips from points; in voxels other than those of the adjustment, by half an edge.
+
+    Parameters
+    ----------
+    voxel_m : float
+    """
+
+    def __init__(self, voxel_m: float) -> None:
+        self.voxel_m = voxel_m
+        self._cells = Gatherer(voxel_m, _LIMIT, merge=True)
+
+    def add(self, xyz_m: Array, strip: npt.NDArray[np.int32]) -> None:
+        """Take points, shape (n, 3); those of strip -1 are left out."""
+        chosen = strip >= 0
+        xyz, of = xyz_m[chosen] + 0.5 * self.voxel_m, strip[chosen]
+        none = np.broadcast_to(np.float64(0.0), (len(of), 4))
+        self._cells.add(np.zeros(len(of), np.int64), xyz, none[:, :3], none, of, of.astype(np.int64))
+
+    def differences(self) -> "Differences":
+        """Differences of all pairs of strips."""
+        cells = self._cells.clusters()
+        index = np.floor(cells["place"] / self.voxel_m).astype(np.int64)
+        order = np.lexsort((cells["strip"], index[:, 2], index[:, 1], index[:, 0]))
+        cells, index = cells[order], index[order]
+        new = np.ones(len(cells) + 1, np.bool_)
+        new[1:-1] = (np.diff(index, axis=0) != 0).any(axis=1)
+        args = (np.flatnonzero(new), cells["place"], cells["scatter"], cells["count"], cells["strip"], self.voxel_m)
+        none = np.empty((0, 8)), np.empty((0, 2), np.int32)
+        count = _pairs(*args, *none, False)
+        value, strips = np.empty((count, 8)), np.empty((count, 2), np.int32)
+        _pairs(*args, value, strips, True)
+        value[:, 4:7] -= 0.5 * self.voxel_m
+        return Differences(value[:, 0], value[:, 1:4], value[:, 4:7], value[:, 7], strips)
+
+
+@dataclass(frozen=True, slots=True)
+class Differences:
+    """Differences between strips.
+
+    Attributes
+    ----------
+    along_m : ndarray, shape (n,)
+        Later strip less earlier one, along the normal.
+    normal : ndarray, shape (n, 3)
+        Up; of walls to the east.
+    place_m : ndarray, shape (n, 3)
+    sigma_m : ndarray, shape (n,)
+        What the scatter of the points lets expect.
+    strips : ndarray of int32, shape (n, 2)
+    """
+
+    along_m: Array
+    normal: Array
+    place_m: Array
+    sigma_m: Array
+    strips: npt.NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.along_m)
+
+    def height_m(self) -> Array:
+        """Differences in height, of level planes."""
+        level = self.normal[:, 2] > LEVEL
+        return np.asarray(self.along_m[level] / self.normal[level, 2])
+
+    def plan_m(self) -> Array:
+        """Differences in plan, of slopes and walls: along their steepest line."""
+        steep = self.normal[:, 2] <= LEVEL
+        return np.asarray(self.along_m[steep] / np.hypot(self.normal[steep, 0], self.normal[steep, 1]))
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of all, of heights and of plan."""
+        return {"normal": figures(self.along_m), "height": figures(self.height_m()), "plan": figures(self.plan_m())} | {
+            "expected_sigma_m": _rounded(np.median(self.sigma_m)) if len(self) else None
+        }
+
+    def by_pair(self, most: int = 200) -> list[dict[str, Any]]:
+        """Figures of the pairs of strips, those with most patches first."""
+        if not len(self):
+            return []
+        pairs, which, count = np.unique(self.strips, axis=0, return_inverse=True, return_counts=True)
+        which = which.ravel()
+        chosen = np.argsort(-count, kind="stable")[:most]
+        return [
+            {"strips": pairs[i].tolist()} | figures(self.along_m[which == i])
+            for i in chosen.tolist()
+        ]  # fmt: skip
+
+
+def figures(value: Array) -> dict[str, Any]:
+    """Count, median, sigmaMAD (1.4826 times the median distance from the median), the median magnitude, and RMS."""
+    if not len(value):
+        return {"count": 0, "median_m": None, "sigma_mad_m": None, "median_abs_m": None, "rms_m": None}
+    median = float(np.median(value))
+    return {
+        "count": len(value),
+        "median_m": _rounded(median),
+        "sigma_mad_m": _rounded(1.4826 * np.median(np.abs(value - median))),
+        "median_abs_m": _rounded(np.median(np.abs(value))),
+        "rms_m": _rounded(np.sqrt(np.mean(np.square(value)))),
+    }
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), 5)
+
+
+@njit(cache=True, nogil=True)
+def _pairs(
+    first: Any, place: Any, scatter: Any, count: Any, strip: Any, voxel_m: float, value: Any, strips: Any, fill: bool
+) -> int:
+    """Count pairs of planes of one voxel, and fill them in: difference, normal, place, sigma."""
+    found = 0
+    normals, low = np.empty((64, 3)), np.empty(64)
+    for v in range(len(first) - 1):
+        start, end = first[v], min(first[v + 1], first[v] + 64)
+        if end - start < 2:
+            continue
+        for i in range(start, end):
+            low[i - start] = -1.0
+            if count[i] < FEWEST:
+                continue
+            s = scatter[i] / count[i]
+            least, middle = flattest(
+                np.float64(s[0]), np.float64(s[1]), np.float64(s[2]), np.float64(s[3]), np.float64(s[4]),
+                np.float64(s[5]), normals[i - start],
+            )  # fmt: skip
+            if least < (0.04 + 0.02 * voxel_m) ** 2 and middle > (0.15 * voxel_m) ** 2 and least < 0.15 * middle:
+                low[i - start] = max(least, 1e-8)
+        for i in range(start, end):
+            for j in range(i + 1, end):
+                a, b = i - start, j - start
+                if low[a] < 0.0 or low[b] < 0.0:
+                    continue
+                dot = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
+                if abs(dot) < _ALIKE:
+                    continue
+                if fill:
+                    sign = 1.0 if dot > 0.0 else -1.0
+                    x = normals[a, 0] + sign * normals[b, 0]
+                    y = normals[a, 1] + sign * normals[b, 1]
+                    z = normals[a, 2] + sign * normals[b, 2]
+                    length = np.sqrt(x * x + y * y + z * z)
+                    if (z < 0.0 and abs(z) > 0.1 * length) or (abs(z) <= 0.1 * length and x < 0.0):
+                        length = -length
+                    x, y, z = x / length, y / length, z / length
+                    d = 0.0
+                    for axis, n in ((0, x), (1, y), (2, z)):
+                        d += n * (place[j, axis] - place[i, axis])
+                        value[found, 4 + axis] = 0.5 * (place[i, axis] + place[j, axis])
+                    value[found, 0], value[found, 1], value[found, 2], value[found, 3] = d, x, y, z
+                    value[found, 7] = np.sqrt(low[a] / count[i] + low[b] / count[j])
+                    strips[found, 0], strips[found, 1] = strip[i], strip[j]
+                found += 1
+    return found
