@@ -20,6 +20,9 @@ Mask = npt.NDArray[np.bool_]
 
 _SAME_EPOCH_NS: Final = 2_000_000
 WITNESS_WINDOW_NS: Final = 10 * NS_PER_S
+_JERK_M_S3: Final = 20.0
+"""What a multirotor's acceleration changes by, at most [m/s^3]."""
+_LONGEST_STEP_S: Final = 1.05
 _DOUBLED: Final = 4.0
 """What doubles a sigma: code has multipath, which its sigma knows nothing of."""
 _CHI2_999: Final = 16.266
@@ -62,7 +65,7 @@ def combined(forward: Solution, backward: Solution, shortest_fix_s: float) -> Co
     ----------
     forward, backward : Solution
     shortest_fix_s : float
-        A fix of one run alone must last this long [s]: short ones are often wrong.
+        A fix of one run alone must last this long [s], without a jump that its velocities do not explain: short ones are often wrong.
     """
     first, second = _pairs(forward, backward)
     alone = np.ones(len(backward), bool)
@@ -134,13 +137,38 @@ def _pairs(forward: Solution, backward: Solution) -> tuple[npt.NDArray[np.int64]
 
 
 def _lasting(solution: Solution, shortest_s: float) -> Mask:
-    """Which rows belong to a run of fixes of at least this length."""
+    """Which rows belong to a run of fixes of at least this length, without a jump in it."""
     fixed = solution.quality == Quality.FIX
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], fixed, [False]]).astype(np.int8)))
+    begins = fixed & ~np.concatenate([[False], fixed[:-1] & ~_jumps(solution)])
+    starts = np.flatnonzero(begins)
     found = np.zeros(len(fixed), bool)
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, limit in zip(starts, np.append(starts, len(fixed))[1:], strict=True):
+        end = start + int(np.argmin(np.append(fixed[start:limit], False)))
         found[start:end] = solution.time_ns[end - 1] - solution.time_ns[start] >= shortest_s * NS_PER_S
     return found
+
+
+def _jumps(solution: Solution) -> Mask:
+    """Steps between rows, shape (n - 1,), that the velocities of both ends do not explain: other ambiguities.
+
+    Velocities come from Doppler shifts, which know nothing of ambiguities. Steps of over `_LONGEST_STEP_S` cannot be judged.
+    """
+    none = np.zeros(max(len(solution) - 1, 0), bool)
+    velocity, covariance = solution.velocity_m_s, solution.velocity_covariance_m2_s2
+    if velocity is None or covariance is None or len(solution) < 2:
+        return none
+    step_s = np.diff(solution.time_ns)[:, None] / NS_PER_S
+    way = _towards(solution.rows(slice(None, -1)), solution.rows(slice(1, None)))
+    missed = way - 0.5 * (velocity[1:] + velocity[:-1]) * step_s
+    # the mean of two velocities misses what a jerk does between them
+    allowed = (_JERK_M_S3 * step_s**3 / 12) ** 2 + 1e-8
+    c = solution.covariance_m2[1:] + solution.covariance_m2[:-1]
+    c = c + 0.25 * step_s[:, :, None] ** 2 * (covariance[1:] + covariance[:-1]) + np.eye(3) * allowed[:, :, None]
+    judged = (step_s[:, 0] <= _LONGEST_STEP_S) & np.isfinite(missed).all(axis=1) & np.isfinite(c).all(axis=(1, 2))
+    none[judged] = (
+        np.einsum("ni,ni->n", missed[judged], np.linalg.solve(c[judged], missed[judged][..., None])[..., 0]) > _CHI2_999
+    )
+    return none
 
 
 def _merge(forward: Solution, backward: Solution, forward_lasts: Mask, backward_lasts: Mask) -> Combined:

@@ -1,4 +1,4 @@
-"""A small world of GPS: broadcast orbits, two receivers, and what they would measure, as RINEX and as u-blox files.
+"""A small world of GPS, and Galileo beside it: broadcast orbits, two receivers, and what they would measure, as RINEX and as u-blox files.
 
 Orbits and clocks by IS-GPS-200 (tables 20-III and 20-IV), so that a program that reads the navigation file finds the very satellites
 that were measured. Pseudorange and carrier phase on L1 with receiver clocks, hydrostatic troposphere, white noise and unknown integers; no
@@ -21,7 +21,7 @@ Path3 = Callable[[Array], Array]
 C_M_S = 299_792_458.0
 L1_HZ = 1_575_420_000.0
 LAMBDA_M = C_M_S / L1_HZ
-MU = 3.986005e14
+MU = {"G": 3.986005e14, "E": 3.986004418e14}
 EARTH_RATE = 7.2921151467e-5
 RELATIVITY = -4.442807633e-10
 A_M, E2 = 6378137.0, 6.69437999014e-3
@@ -60,6 +60,7 @@ class Orbits:
     week: int
     toe_s: float
     prn: npt.NDArray[np.int64]
+    """Galileo's are those over 100."""
     root_a: Array
     eccentricity: Array
     m0: Array
@@ -82,7 +83,8 @@ class Orbits:
         """ECEF positions [m], shape (n, 3), and clock errors [s] at true GPS times, shape (n, satellites) -> (n, satellites, 3)."""
         t = tow_s - self.toe_s
         a = self.root_a**2
-        m = self.m0 + (np.sqrt(MU / a**3) + self.delta_n) * t
+        mu = np.where(self.prn > 100, MU["E"], MU["G"])
+        m = self.m0 + (np.sqrt(mu / a**3) + self.delta_n) * t
         e = m.copy()
         for _ in range(20):
             e = m + self.eccentricity * np.sin(e)
@@ -106,11 +108,16 @@ class Orbits:
         return place, clock
 
 
-def constellation(week: int, toe_s: float, seed: int = 1) -> Orbits:
-    """30 satellites in six planes."""
+def constellation(week: int, toe_s: float, seed: int = 1, *, galileo: bool = False) -> Orbits:
+    """30 satellites of GPS in six planes; with Galileo, 24 more in three."""
     rng = np.random.default_rng(seed)
-    n = 30
-    plane, slot = np.divmod(np.arange(n), 5)
+    n = 54 if galileo else 30
+    plane, slot = np.divmod(np.arange(30), 5)
+    phase, node, prn = slot / 5 + plane / 30, plane * 60.0, np.arange(1, 31)
+    if galileo:
+        plane, slot = np.divmod(np.arange(24), 8)
+        phase, node = np.append(phase, slot / 8 + plane / 24), np.append(node, plane * 120.0 + 20.0)
+        prn = np.append(prn, np.arange(101, 125))
     omega = rng.uniform(-3, 3, n)
 
     def kept(values: Array) -> Array:
@@ -119,14 +126,14 @@ def constellation(week: int, toe_s: float, seed: int = 1) -> Orbits:
     return Orbits(
         week=week,
         toe_s=toe_s,
-        prn=np.arange(1, n + 1),
-        root_a=kept(5153.65 + rng.normal(0, 0.05, n)),
+        prn=prn,
+        root_a=kept(np.where(prn > 100, 5440.6, 5153.65) + rng.normal(0, 0.05, n)),
         eccentricity=kept(rng.uniform(0.002, 0.015, n)),
-        m0=kept((2 * np.pi * (slot / 5 + plane / 30) + rng.normal(0, 0.1, n) - omega) % (2 * np.pi)),
+        m0=kept((2 * np.pi * phase + rng.normal(0, 0.1, n) - omega) % (2 * np.pi)),
         delta_n=kept(rng.normal(4.5e-9, 2e-10, n)),
         inclination=kept(np.deg2rad(55.0 + rng.normal(0, 0.5, n))),
         idot=kept(rng.normal(0, 2e-10, n)),
-        omega0=kept((np.deg2rad(60.0) * plane + 0.3) % (2 * np.pi) - np.pi),
+        omega0=kept((np.deg2rad(node) + 0.3) % (2 * np.pi) - np.pi),
         omega_dot=kept(rng.normal(-8e-9, 2e-10, n)),
         omega=kept(omega),
         cuc=kept(rng.normal(0, 2e-6, n)),
@@ -275,14 +282,17 @@ def write_observations(
     """RINEX 3.04 or 2.11 with C1, L1 and D1 of GPS; `approximate_m` goes into the header, `height_m` is the antenna's above the marker."""
     x, y, z = np.zeros(3) if approximate_m is None else approximate_m
     first, seconds = _epoch(receiver.week, float(receiver.tow_s[0]))
+    mixed = "M: Mixed" if receiver.prn.max() > 100 else "G (GPS)"
     head = [
-        _line(f"{float(version):9.2f}           OBSERVATION DATA    G (GPS)", "RINEX VERSION / TYPE"),
+        _line(f"{float(version):9.2f}           OBSERVATION DATA    {mixed}", "RINEX VERSION / TYPE"),
         _line("made for a test", "COMMENT"),
         _line(f"{x:14.4f}{y:14.4f}{z:14.4f}", "APPROX POSITION XYZ"),
         _line(f"{height_m:14.4f}{0.0:14.4f}{0.0:14.4f}", "ANTENNA: DELTA H/E/N"),
     ]
     if version.startswith("3"):
-        head.append(_line("G    3 C1C L1C D1C", "SYS / # / OBS TYPES"))
+        head += [
+            _line(f"{letter}    3 C1C L1C D1C", "SYS / # / OBS TYPES") for letter in ("GE" if mixed[0] == "M" else "G")
+        ]
     else:
         head.append(_line("     3    C1    L1    D1", "# / TYPES OF OBSERV"))
     stamp = f"{first.year:6d}{first.month:6d}{first.day:6d}{first.hour:6d}{first.minute:6d}  {seconds}     GPS"
@@ -301,7 +311,7 @@ def _epoch_lines(receiver: Receiver, k: int, version: str) -> list[str]:
         f"{receiver.code_m[k, s]:14.3f}  {receiver.phase_cycles[k, s]:14.3f}{mark} {receiver.doppler_hz[k, s]:14.3f}  \n"
         for s, mark in zip(seen, lost, strict=True)
     ]
-    names = [f"G{receiver.prn[s]:02d}" for s in seen]
+    names = [_name(receiver.prn[s]) for s in seen]
     if version.startswith("3"):
         head = f"> {moment:%Y %m %d %H %M}{seconds}  0{len(seen):3d}\n"
         return [head, *(name + value for name, value in zip(names, values, strict=True))]
@@ -314,12 +324,12 @@ def write_navigation(path: Path, orbits: Orbits, *, version: str = "3.04") -> No
     """RINEX 3.04 or 2.11 navigation file of GPS: one set for each satellite."""
     moment, _ = _epoch(orbits.week, orbits.toe_s)
     with path.open("w", encoding="ascii") as file:
-        code = "N: GNSS NAV DATA    G: GPS" if version.startswith("3") else "N: GPS NAV DATA"
+        code = "N: GNSS NAV DATA    M: Mixed" if version.startswith("3") else "N: GPS NAV DATA"
         file.write(_line(f"{float(version):9.2f}           {code}", "RINEX VERSION / TYPE"))
         file.write(_line("", "END OF HEADER"))
         for s in range(len(orbits.prn)):
             if version.startswith("3"):
-                head, indent = f"G{orbits.prn[s]:02d} {moment:%Y %m %d %H %M %S}", "    "
+                head, indent = f"{_name(orbits.prn[s])} {moment:%Y %m %d %H %M %S}", "    "
             else:
                 clock = f"{moment.month:2d} {moment.day:2d} {moment.hour:2d} {moment.minute:2d}"
                 head, indent = f"{orbits.prn[s]:2d} {moment:%y} {clock} {moment.second:4.1f}", "   "
@@ -328,12 +338,16 @@ def write_navigation(path: Path, orbits: Orbits, *, version: str = "3.04") -> No
                 (orbits.cuc[s], orbits.eccentricity[s], orbits.cus[s], orbits.root_a[s]),
                 (orbits.toe_s, orbits.cic[s], orbits.omega0[s], orbits.cis[s]),
                 (orbits.inclination[s], orbits.crc[s], orbits.omega[s], orbits.omega_dot[s]),
-                (orbits.idot[s], 1.0, float(orbits.week), 0.0),
+                (orbits.idot[s], 517.0 if orbits.prn[s] > 100 else 1.0, float(orbits.week), 0.0),  # 517: I/NAV
                 (2.0, 0.0, 0.0, 0.0),
                 (orbits.toe_s - 6.0, 4.0),
             ]
             file.write(head + "".join(_exponent(v) for v in (orbits.af0[s], orbits.af1[s], 0.0)) + "\n")
             file.writelines(indent + "".join(_exponent(v) for v in row) + "\n" for row in rows)
+
+
+def _name(prn: int) -> str:
+    return f"E{prn - 100:02d}" if prn > 100 else f"G{prn:02d}"
 
 
 def _exponent(value: float) -> str:
@@ -350,7 +364,8 @@ def write_ubx(path: Path, receiver: Receiver) -> None:
                 body += struct.pack(
                     "<ddfBBBBHBBBBBx",
                     receiver.code_m[k, s], receiver.phase_cycles[k, s], receiver.doppler_hz[k, s],
-                    0, int(receiver.prn[s]), 0, 0, 0 if receiver.slipped[k, s] else 64000, 45, 3, 1, 4, 7,
+                    2 if receiver.prn[s] > 100 else 0, int(receiver.prn[s]) % 100, 0, 0,
+                    0 if receiver.slipped[k, s] else 64000, 45, 3, 1, 4, 7,
                 )  # fmt: skip
             file.write(ubx_frame(0x02, 0x15, body))
 

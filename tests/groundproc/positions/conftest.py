@@ -56,9 +56,9 @@ class World:
 
 @pytest.fixture(scope="session")
 def make_world(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., World]:
-    def make(seed: int, **worse: Any) -> World:
+    def make(seed: int, *, galileo: bool = False, **worse: Any) -> World:
         world = World(tmp_path_factory.mktemp(f"gnss{seed}"), None)  # type: ignore[arg-type]
-        orbits = gnss.constellation(WEEK, START_S, seed)
+        orbits = gnss.constellation(WEEK, START_S, seed, galileo=galileo)
         times_s = START_S + np.arange(0, 60, 0.2)
         rover = gnss.measure(orbits, world.place_m, times_s, seed=seed + 100, clock=(3.1e-4, 2e-7), **worse)
         still = lambda t: np.broadcast_to(world.base_m, (len(t), 3))  # noqa: E731
@@ -67,10 +67,11 @@ def make_world(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., World]
         gnss.write_observations(folder / "rover.obs", rover)
         gnss.write_observations(folder / "base.obs", base, approximate_m=world.base_m)
         marker = world.base_m - 1.5 * gnss.mat_enu_ecef(*BASE_PLACE[:2])[2]
-        gnss.write_observations(folder / "base.24o", base, version="2.11", approximate_m=marker, height_m=1.5)
+        if not galileo:  # version 2.11 is for GPS here
+            gnss.write_observations(folder / "base.24o", base, version="2.11", approximate_m=marker, height_m=1.5)
+            gnss.write_navigation(folder / "brdc.24n", orbits, version="2.11")
         gnss.write_observations(folder / "unplaced.obs", base)
         gnss.write_navigation(folder / "brdc.nav", orbits)
-        gnss.write_navigation(folder / "brdc.24n", orbits, version="2.11")
         gnss.write_ubx(folder / "rover.ubx", rover)
         gnss.write_ubx(folder / "base.ubx", base)
         return World(folder, rover)

@@ -146,3 +146,24 @@ def test_metres_of_multipath_and_times_without_witness_refute_nothing() -> None:
     assert refuted(fixes, track([4] * 40, 2.0, 1.0)) == (fixes, 0)
     elsewhere = replace(track([4] * 40, 50.0, 1.0), time_ns=np.arange(40) * 10**9 + 10**15)
     assert refuted(fixes, elsewhere) == (fixes, 0)
+
+
+def test_a_run_of_fixes_ends_where_its_velocities_do_not_explain_a_step() -> None:
+    still = {
+        "velocity_m_s": np.zeros((20, 3)),
+        "velocity_covariance_m2_s2": diagonal_covariance(np.full((20, 3), 0.02)),
+    }
+    jumping = replace(track(LONG), **still)
+    # for five seconds in the middle; at 1 Hz a jerk may explain metres, but not eight
+    away = np.where((np.arange(20) >= 8) & (np.arange(20) < 13), 8.0, 0.0)
+    jumping = replace(jumping, latitude_deg=jumping.latitude_deg + away * METRE_DEG)
+    steady = replace(track(LONG), **still)
+    for pair in ((jumping, steady), (steady, jumping)):
+        found = combined(*pair, LASTING)
+        assert found.contradicted == 5
+        assert (found.solution.quality == Quality.FIX).all()
+        np.testing.assert_allclose(north_m(found.solution), 0.0, atol=1e-3)
+    assert found.solution.velocity_m_s is not None
+    # without velocities, nobody can tell
+    blind = replace(jumping, velocity_m_s=None, velocity_covariance_m2_s2=None)
+    assert (combined(blind, track(LONG), LASTING).solution.quality[8:13] == Quality.FLOAT).all()

@@ -75,6 +75,31 @@ def test_fixes_are_the_known_path_within_their_sigmas(
     assert np.concatenate(floats).mean() < 3 * 3 if any(map(len, floats)) else True
 
 
+def test_two_systems_fix_everything_and_centimetres_stay_under_multipath(
+    make_world: Callable[..., Any], tmp_path: Path
+) -> None:
+    lengths, share = [], []
+    for seed, multipath in ((1, (0.0, 0.0, 20.0)), (7, (0.5, 0.003, 20.0)), (8, (0.5, 0.003, 20.0))):
+        world = make_world(seed, galileo=True, multipath=multipath)
+        output = tmp_path / f"{seed}.pos"
+        words = [
+            str(world.folder / "rover.ubx"),
+            "--base",
+            str(world.folder / "base.obs"),
+            "--nav",
+            str(world.folder / "brdc.nav"),
+        ]
+        assert main(["ppk", *words, "-o", str(output), "--json"]) == 0
+        found = read_solution(output)
+        fixed = found.quality == Quality.FIX
+        share.append(fixed.mean())
+        lengths.append(np.linalg.norm(world.errors_m(found)[fixed], axis=1))
+    assert share[0] == 1.0
+    assert min(share) > 0.3
+    # a wrong fix is off by decimetres
+    assert np.concatenate(lengths).max() < 0.1
+
+
 def test_the_summary_says_what_came_of_it(run: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     output = run("rover.obs", "base.obs", "--json")
     summary = json.loads(capsys.readouterr().out)
