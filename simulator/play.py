@@ -3,11 +3,13 @@
 To whoever records, it is the sensor's network and the autopilot's serial port.
 """
 
+import fcntl
 import heapq
 import os
 import pty
 import socket
 import struct
+import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
@@ -24,6 +26,7 @@ _PCAP_HEAD: Final = 24
 _FRAME_HEAD: Final = 42
 _SLICE_S: Final = 0.002
 """Events due within this time are sent together; a timer is not finer than this on a busy machine."""
+_PATIENCE_S: Final = 0.5
 
 
 class Target(NamedTuple):
@@ -144,7 +147,24 @@ def play(
                 _send(sock, event.payload, (address, ports.get(event.port, target.position_port)), played)
             else:
                 _write(master, event.payload, played)
+        _drain(slave)
         return played
+
+
+def _drain(slave: int) -> None:
+    """Wait for the reader: what is unread when the terminal closes is lost. Not for one who has stopped reading."""
+    left, patience_s = _unread(slave), _PATIENCE_S
+    while left and patience_s > 0:
+        time.sleep(_SLICE_S)
+        now = _unread(slave)
+        patience_s = _PATIENCE_S if now < left else patience_s - _SLICE_S
+        left = now
+
+
+def _unread(slave: int) -> int:
+    """Bytes that wait in the terminal."""
+    (count,) = struct.unpack("i", fcntl.ioctl(slave, termios.FIONREAD, bytes(4)))
+    return int(count)
 
 
 def _link(link: Path, path: str) -> None:
