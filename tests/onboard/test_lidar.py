@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from lidar_stream import Stream, from_address, packet
 
-from flightlog import records
+from flightlog import hdl32e, records
 from flightlog.records import LidarAccount
 from onboard.config import FovConfig, LidarConfig
-from onboard.lidar import LidarPort
+from onboard.lidar import LidarPort, PacketFields
 from onboard.timesync import LogTime, read_clocks
 
 
@@ -165,6 +165,23 @@ def test_a_batch_spans_about_a_tenth_of_a_second(monterey_data: list[bytes]) -> 
     scans = [records.receive_time_ns(records.decode_scan(data)) for _, data in session.of(records.LIDAR.topic)]
     assert 5 <= len(scans) <= 14
     assert np.median([times[-1] - times[0] for times in scans]) < 150e6
+
+
+def test_a_batch_taken_as_it_is_holds_nothing_but_an_hdl32es_packets() -> None:
+    slots = np.zeros(3, records.SCAN_PACKET_DTYPE)
+    slots["data"]["blocks"]["flag"] = hdl32e.BLOCK_FLAG
+    fields = PacketFields(slots)
+    for mode in range(256):
+        for product in (0, 0x20, 0x21, 0x22, 0xFF, mode):
+            slots["data"]["return_mode"], slots["data"]["product"] = mode, product
+            assert fields.good(3) == hdl32e.is_data(slots["data"]).all()
+    slots["data"]["return_mode"], slots["data"]["product"] = hdl32e.ReturnMode.DUAL, hdl32e.PRODUCT_ID
+    slots["data"]["return_mode"][2] = hdl32e.ReturnMode.LAST  # good too, but not alike: these are sorted one by one
+    assert fields.good(2)
+    assert not fields.good(3)
+    slots["data"]["blocks"]["flag"][1, 7] = 0xDDFF
+    assert fields.good(1)
+    assert not fields.good(2)
 
 
 def test_few_looks_at_the_socket_make_messages_of_a_tenth_of_a_second_each_with_its_account() -> None:
