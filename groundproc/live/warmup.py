@@ -1,0 +1,50 @@
+"""Compiles or loads every kernel before the first packet, so that none of them makes the flight wait."""
+
+from typing import cast
+
+import numpy as np
+
+from flightlog import hdl32e, records
+from groundproc.adjustment.motion import Motion
+from groundproc.adjustment.odometry import Odometry, State
+from groundproc.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
+from groundproc.adjustment.spline import Path, integrated
+from groundproc.decode import Gate
+from groundproc.geodesy import LocalFrame
+from groundproc.live.motion import GrowingMotion
+from groundproc.live.slicer import Slicer
+from groundproc.live.voxelcloud import VoxelCloud
+from groundproc.trajectory.trajectory import Trajectory
+
+
+def warm_up() -> None:
+    """Run a tenth of a second of nothing through everything."""
+    motion = GrowingMotion(0, 1e-3, 1e-2, "none")
+    rest = np.zeros((3 * STEPS, 3))
+    motion.extend(rest, rest + np.array([0.0, 0.0, 9.8]), np.ones(3 * STEPS, np.bool_))
+    gravity = np.array([0.0, 0.0, -9.80665])
+    state = State(
+        np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), gravity, 1e-4 * np.eye(18)
+    )
+    odometry = Odometry(state, cast(Motion, motion), 0, 0.5)
+    side = np.linspace(1.0, 5.0, 60)
+    floor = np.stack([*np.meshgrid(side, side), np.full((60, 60), -2.0)], axis=-1).reshape(-1, 3).astype(np.float32)
+    for number in range(3):
+        times = number * SLICE_NS + np.linspace(0, SLICE_NS - 1, len(floor)).astype(np.int64)
+        odometry.step(Slice(number, times, floor))
+    odometry.map.forget_beyond(np.zeros(3), 100.0)
+    quat = integrated(rest[:STEPS], state.quat)
+    cloud = VoxelCloud(1.0, 1 << 20)
+    cloud.add(
+        np.arange(len(floor)) * STEP_NS // 100, floor, np.zeros(len(floor), np.uint8), Path(0, quat, rest[: STEPS + 1])
+    )
+    for mode in (hdl32e.ReturnMode.STRONGEST, hdl32e.ReturnMode.DUAL):
+        packets = np.zeros(2, records.SCAN_PACKET_DTYPE)
+        packets["data"]["return_mode"] = mode
+        Slicer(Gate()).feed(packets, np.arange(2) * 552_960)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
+    zero = np.zeros((2, 3))
+    flags = np.array([True, False])
+    Trajectory(
+        LocalFrame(0.0, 0.0, 0.0), np.array([0, SLICE_NS]), zero, zero, level, zero, zero, zero, flags
+    ).where_covered(np.array([0, 1]))
