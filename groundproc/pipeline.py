@@ -69,6 +69,8 @@ def process(
             readers, timeline, made, survey, projection, folder, functools.partial(progress, "place")
         )
         write_trajectory(folder / "trajectory.csv", trajectory)
+        for write in made.products:
+            write(folder)
         draw_cloud(folder, sample, projection.crs.name)
         quality = describe(readers, survey, made, mount_source, flight, timeline, projection, tally)
         with written_aside(folder / "quality.json") as aside:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from flightlog.config import option
 from flightlog.mount import Mount
+from groundproc.calibration.options import DynamicOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +25,12 @@ class Survey:
         "for height: ellipsoid where the autopilot does not state both heights: the geoid's height above the ellipsoid "
         "there [m], or a grid file that PROJ reads (.gtx, .tif)",
     )
-    method: str = option("ins", "how the trajectory is made", choices=("ins", "adjusted"))
+    method: str = option("ins", "how the trajectory is made", choices=("ins", "dynamic", "adjusted"))
     causal: bool = option(False, "adjusted: use nothing of the future, as in flight")
+    dynamic: DynamicOptions = option(DynamicOptions, "method dynamic: trims once per revolution of the scanner")
+    compass: str | None = option(
+        None, "method dynamic: a compass model to begin with, from `swath compass`, looked for beside this file; null: none"
+    )
     pose_grid_ms: float | None = option(
         None,
         "one pose for so many milliseconds, as the source did with 10; null: a pose for every firing",

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from flightlog.logfile import LogReader
@@ -69,6 +70,8 @@ class Estimate:
         What else there is to say; stands in quality.json under the method's name.
     warning : str
         One sentence where the self-check found something wrong; empty where all is well.
+    products : tuple of callable
+        Each is called with the folder of the products and writes files of the method's own into it.
     """
 
     trajectory: Trajectory
@@ -77,6 +80,7 @@ class Estimate:
     lasers: LaserTable = field(default_factory=LaserTable.nominal)
     report: dict[str, Any] = field(default_factory=dict)
     warning: str = ""
+    products: tuple[Callable[[Path], None], ...] = ()
 
 
 def gather(

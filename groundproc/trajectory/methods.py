@@ -7,6 +7,7 @@ import numpy as np
 
 from flightlog.errors import LogError
 from groundproc.adjustment import adjusted
+from groundproc.calibration import dynamic
 from groundproc.trajectory import ins
 from groundproc.trajectory.method import Estimate, Given, Progress
 from groundproc.trajectory.trajectory import Trajectory, joined
@@ -53,7 +54,13 @@ def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
     return adjusted.estimate(given, progress, ins_estimate(given, progress).trajectory)
 
 
+def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
+    """The source's dynamic calibration of another method's trajectory."""
+    return dynamic.dynamic_estimate(given, progress, METHODS[given.survey.dynamic.start])
+
+
 METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
     "ins": ins_estimate,
+    "dynamic": dynamic_estimate,
     "adjusted": adjusted_estimate,
 }

@@ -1,0 +1,148 @@
+"""The compass model: yaw trim as a smooth function of the compass' heading, learnt from several runs, to begin later runs with.
+
+Source: FOI-R--4045--SE (2014) plots yaw trims over heading for seven runs and takes a curve through them. Here the curve is a constant
+and some harmonics: iron that turns with the compass gives one period in a turn, iron that is magnetised by the Earth two (as in the
+compensation of ships' compasses). Its covariance comes from the scatter of runs and headings.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import config
+from flightlog.config import option
+from flightlog.errors import LogError
+from groundproc.files import written_aside
+
+Array = npt.NDArray[np.float64]
+
+BINS: Final = 36
+"""Sectors of heading; a run gives one value for each that it went through: its trims there are not independent of each other."""
+PRIOR_DEG: Final = 15.0
+"""What harmonics are before anything is known, one sigma: holds them where few headings were seen [deg]."""
+LEAST_SCATTER_DEG: Final = 0.1
+"""No run is believed to be better than this [deg]."""
+HUBER: Final = 1.5
+ROUNDS: Final = 10
+
+
+@dataclass(frozen=True, slots=True)
+class CompassCurve:
+    """What is to be added to the compass' heading."""
+
+    coefficients_deg: tuple[float, ...] = option(
+        (0.0,), "constant, then sine and cosine of the heading, of twice the heading, ... [deg]"
+    )
+    covariance_deg2: tuple[tuple[float, ...], ...] = option(((0.0,),), "of the coefficients [deg^2]")
+    scatter_deg: float = option(0.0, "of single runs about the curve, one sigma [deg]", minimum=0)
+    runs: int = option(0, "runs it was learnt from", minimum=0)
+    seen: float = option(0.0, "share of all headings that were seen", minimum=0, maximum=1)
+
+    def __post_init__(self) -> None:
+        size = len(self.coefficients_deg)
+        if size % 2 == 0:
+            raise ValueError(f"{size} coefficients found, expected an odd number: a constant and pairs")
+        if len(self.covariance_deg2) != size or any(len(row) != size for row in self.covariance_deg2):
+            raise ValueError(f"a covariance that is not {size} x {size} found, expected one for {size} coefficients")
+
+    def trim_rad(self, heading_rad: Array) -> Array:
+        """Yaw trim at compass headings, shape (n,)."""
+        design = _design(np.asarray(heading_rad), len(self.coefficients_deg))
+        return np.asarray(np.deg2rad(design @ np.array(self.coefficients_deg)))
+
+    def sigma_rad(self, heading_rad: Array) -> Array:
+        """One sigma of that: of the curve and of a single run about it, shape (n,)."""
+        design = _design(np.asarray(heading_rad), len(self.coefficients_deg))
+        variance = np.einsum("ni,ij,nj->n", design, np.array(self.covariance_deg2), design)
+        return np.asarray(np.deg2rad(np.sqrt(np.maximum(variance, 0.0) + self.scatter_deg**2)))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Yaw trims of a run.
+
+    Attributes
+    ----------
+    heading_rad : ndarray, shape (n,)
+        As the compass had it.
+    trim_rad : ndarray, shape (n,)
+        In all, that of a curve it began with included.
+    """
+
+    heading_rad: Array
+    trim_rad: Array
+
+
+def fit_compass(runs: Sequence[Run], harmonics: int = 2) -> CompassCurve:
+    """A curve through the yaw trims of several runs, robust against runs and headings that went wrong (Huber).
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Settled trims only.
+    harmonics : int
+        1: what turns with the compass; 2: what the Earth magnetises as well; no more than the data bear.
+
+    Raises
+    ------
+    LogError
+        No run has a trim.
+    """
+    parts = [_sectors(run) for run in runs]
+    heading = np.concatenate([np.empty(0), *(part[0] for part in parts)])
+    observed = np.concatenate([np.empty(0), *(part[1] for part in parts)])
+    if len(heading) == 0:
+        raise LogError(
+            "compass: no run has settled yaw trims; a vehicle has to move past something that stands upright"
+        )
+    size = 1 + 2 * harmonics
+    design = _design(heading, size)
+    prior = np.diag([0.0] + [PRIOR_DEG**-2] * (size - 1))
+    weight, scatter = np.ones(len(observed)), 1.0
+    coefficients = np.zeros(size)
+    for _ in range(ROUNDS):
+        normal = design.T @ (weight[:, None] * design) / scatter**2 + prior
+        coefficients = np.linalg.solve(normal, design.T @ (weight * observed) / scatter**2)
+        residual = observed - design @ coefficients
+        freedom = max(weight.sum() - min(size, len(observed) - 1), 1.0)
+        scatter = max(float(np.sqrt((weight * residual**2).sum() / freedom)), LEAST_SCATTER_DEG)
+        weight = np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(residual), 1e-12))
+    covariance = np.linalg.inv(design.T @ (weight[:, None] * design) / scatter**2 + prior)
+    seen = len(np.unique(np.floor(heading / (2 * np.pi) * BINS).astype(int) % BINS)) / BINS
+    rows = tuple(tuple(row) for row in covariance.tolist())
+    return CompassCurve(tuple(coefficients.tolist()), rows, scatter, len(runs), seen)
+
+
+def _sectors(run: Run) -> tuple[Array, Array]:
+    """Mean heading [rad] and median trim [deg] in each sector of heading that a run went through."""
+    heading = np.asarray(run.heading_rad) % (2 * np.pi)
+    trim_deg = np.rad2deg((np.asarray(run.trim_rad) + np.pi) % (2 * np.pi) - np.pi)
+    sector = np.minimum((heading / (2 * np.pi) * BINS).astype(int), BINS - 1)
+    chosen = np.unique(sector)
+    return (
+        np.array([heading[sector == i].mean() for i in chosen]),
+        np.array([np.median(trim_deg[sector == i]) for i in chosen]),
+    )
+
+
+def _design(heading_rad: Array, size: int) -> Array:
+    """Constant, sines and cosines at headings: shape (n, size)."""
+    columns = [np.ones(len(heading_rad))]
+    for order in range(1, size // 2 + 1):
+        columns += [np.sin(order * heading_rad), np.cos(order * heading_rad)]
+    return np.stack(columns, axis=1)
+
+
+def write_compass(path: Path, curve: CompassCurve) -> None:
+    """Write compass.yaml."""
+    with written_aside(path) as aside:
+        aside.write_text(config.dump(curve), encoding="utf-8")
+
+
+def read_compass(path: Path) -> CompassCurve:
+    """Read compass.yaml; ConfigError where it is not one."""
+    return config.load(path, CompassCurve)
