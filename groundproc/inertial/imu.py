@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import Akima1DInterpolator, CubicSpline
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import butter, sosfiltfilt
 
 from groundproc.sync.tracks import low_pass
@@ -32,6 +33,8 @@ SWUNG_HZ: Final = 10.0
 """Up to here the force of the lidar's swinging about the INS is taken off; beyond, it moves nothing far."""
 BLOCKS_S: Final = (0.4, 1.0, 2.5)
 """Lengths over which differences are averaged to tell their noise at low frequency; the worst counts: vibration aliases to lines."""
+NOISE_S: Final = 5.0
+"""Stretch over which noise is learnt."""
 LEAST_COMMON: Final = 50
 MOST_ALIGNED: Final = 40_000
 """Samples of a fit."""
@@ -103,25 +106,27 @@ class Signal:
     alignment: Alignment | None = None
 
 
-def noise_density(samples: Samples) -> Array:
-    """Power spectral density of the noise of samples, taken as white, shape (3,): what a cubic through six of them in a row leaves.
+def noise_density(samples: Samples, time_s: Array) -> Array:
+    """Power spectral density of the noise about some times, shape as these: what a cubic through six samples in a row leaves, taken as white.
 
-    Motion that the samples are too slow for counts as noise: it is what integrating them will miss.
+    Motion that the samples are too slow for counts as noise, for it is what integrating them will miss; it changes in flight, and so
+    the mean is that of `NOISE_S` around.
     """
     count = len(samples.time_s) // 6
     if count < 5:
-        return np.full(3, np.inf)
-    chosen = np.linspace(0, count - 1, min(count, 5000)).astype(int)
-    time_s = samples.time_s[: 6 * count].reshape(count, 6)[chosen]
-    value = samples.value[: 6 * count].reshape(count, 6, 3)[chosen]
-    span = time_s[:, -1:] - time_s[:, :1]
+        return np.full(len(time_s), 1e3)
+    stamp_s = samples.time_s[: 6 * count].reshape(count, 6)
+    value = samples.value[: 6 * count].reshape(count, 6, 3)
+    span = stamp_s[:, -1:] - stamp_s[:, :1]
+    basis = ((stamp_s - stamp_s[:, :1]) / span)[..., None] ** np.arange(4)
+    fitted, _ = np.linalg.qr(basis)
+    left = value - fitted @ (np.swapaxes(fitted, 1, 2) @ value)
+    density = np.square(left).sum(axis=(1, 2)) / 2.0 / 3.0 * span[:, 0] / 5.0
+    # groups of samples with a hole among them tell nothing
     whole = span[:, 0] < 2.0 * np.median(span)
-    basis = ((time_s - time_s[:, :1]) / span)[..., None] ** np.arange(4)
-    left = value - basis @ np.linalg.pinv(basis) @ value
-    square = np.square(left[whole]).sum(axis=1) / 2.0
-    # the mean of two squared normals, from the median: robust
-    variance = np.median(square, axis=0) / np.log(2.0)
-    return np.asarray(variance / samples.rate_hz)
+    middle_s, density = stamp_s[whole, 2], density[whole]
+    around = max(NOISE_S / (6.0 * float(np.median(np.diff(samples.time_s)))), 1.5)
+    return np.interp(time_s, middle_s, gaussian_filter1d(density, around / 2.0, mode="nearest"))
 
 
 def step_means(samples: Samples, nodes_s: Array, longest_s: float, smooth: bool) -> tuple[Array, Mask]:
@@ -269,8 +274,9 @@ def combine(
     if fast is None:
         return None if slow is None else _alone(nodes_s, slow)
     mean, good = step_means(fast, nodes_s, LONGEST_HOLE_S, smooth=False)
-    own = float(noise_density(fast).mean())
     middle_s = nodes_s[:-1] + 0.5 * step_s
+    density = noise_density(fast, middle_s)
+    own = float(density.mean())
     levers = None
     if rate_rad_s is not None and lever_m is not None:
         gentle = flat_low_pass(rate_rad_s, SWUNG_HZ, 1.0 / step_s)
@@ -281,9 +287,8 @@ def combine(
         told = mean @ alignment.matrix.T
         if levers is not None:
             told -= levers @ alignment.lever_m
-        density = np.where(good, own, np.inf)
         return Signal(told, density, good, fast.name, 0.0, alignment)
-    time_s, place, share = common
+    time_s, place, chosen = common
     cutoff_hz = min(SHARED_HZ, 0.4 * slow.rate_hz)
     at = CubicSpline(middle_s, flat_low_pass(mean, cutoff_hz, 1.0 / step_s), axis=0)(time_s)
     shared_at = CubicSpline(middle_s, flat_low_pass(mean, SHARED_HZ, 1.0 / step_s), axis=0)(time_s)
@@ -291,7 +296,7 @@ def combine(
     shared_noise = own * 2.0 * ALIGNED_HZ
     lever_rows = None if levers is None else levers[place]
     nominal = np.zeros(3) if lever_m is None else lever_m
-    slow_value = slow.value[share]
+    slow_value = slow.value[chosen]
     alignment = align(slow_value, shared_at, gentle_at, shared_noise, mat_ins_fast, prior_sigma, lever_rows, nominal)
     told = mean @ alignment.matrix.T + alignment.offset
     predicted = at @ alignment.matrix.T + alignment.offset
@@ -307,9 +312,8 @@ def combine(
     weight = np.where(np.isfinite(both), own / (own + other), 0.0)
     on_grid = np.stack([np.interp(middle_s, time_s, axis) for axis in difference.T], axis=1)
     told += weight * low_pass(on_grid, float(np.clip(0.12 * slow.rate_hz, 0.5, 15.0)), 1.0 / step_s)
-    left = own * (1.001 - float(weight.mean()))
-    sources = f"{slow.name}, {fast.name}"
-    fused = Signal(told, np.full(len(told), left), good, sources, float(weight.mean()), alignment)
+    share = float(weight.mean())
+    fused = Signal(told, density * (1.001 - share), good, f"{slow.name}, {fast.name}", share, alignment)
     return fused if good.all() else _filled(fused, _alone(nodes_s, slow))
 
 
@@ -324,8 +328,7 @@ def _common(slow: Samples, middle_s: Array, good: Mask) -> tuple[Array, npt.NDAr
 
 def _alone(nodes_s: Array, slow: Samples) -> Signal:
     mean, good = step_means(slow, nodes_s, max(LONGEST_SLOW_HOLE_S, 3.0 / slow.rate_hz), smooth=True)
-    density = float(noise_density(slow).mean())
-    return Signal(mean, np.full(len(mean), density), good, slow.name)
+    return Signal(mean, noise_density(slow, 0.5 * (nodes_s[1:] + nodes_s[:-1])), good, slow.name)
 
 
 def _filled(signal: Signal, other: Signal) -> Signal:

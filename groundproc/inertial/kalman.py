@@ -97,31 +97,49 @@ def _step(k: int, reference: Any, imu: Any, gravity: float, couple: Any, defect:
 
 @njit(cache=True, nogil=True)
 def _forward_rows(m: Any, dt: float, couple: Any, keep: Any) -> None:
-    """Transition of the columns of m, in place: m <- transition @ m."""
+    """Transition of the columns of m, in place: m <- transition @ m. Loops run along the rows, so that they vectorise."""
     columns = m.shape[1]
-    fx, fy, fz = couple[0, 0], couple[0, 1], couple[0, 2]
-    read = np.empty(3)
-    for j in range(columns):
-        a, b, c = m[ATTITUDE, j], m[ATTITUDE + 1, j], m[ATTITUDE + 2, j]
-        for axis in range(3):
-            row = GYRO_MATRIX + 3 * axis
-            read[axis] = dt * m[GYRO_BIAS + axis, j] + (
-                couple[4, 0] * m[row, j] + couple[4, 1] * m[row + 1, j] + couple[4, 2] * m[row + 2, j]
+    # attitude error turns the force: error x force
+    turn = np.array(
+        [
+            [0.0, couple[0, 2], -couple[0, 1]],
+            [-couple[0, 2], 0.0, couple[0, 0]],
+            [couple[0, 1], -couple[0, 0], 0.0],
+        ]
+    )
+    read = np.empty((3, columns))
+    for i in range(3):
+        row = GYRO_MATRIX + 3 * i
+        for j in range(columns):
+            read[i, j] = (
+                dt * m[GYRO_BIAS + i, j]
+                + couple[4, 0] * m[row, j]
+                + couple[4, 1] * m[row + 1, j]
+                + couple[4, 2] * m[row + 2, j]
             )
-        # attitude error turns the force: error x force
-        turned = (b * fz - c * fy, c * fx - a * fz, a * fy - b * fx)
-        for i in range(3):
-            pushed = turned[i] - dt * (
-                couple[1 + i, 0] * m[FORCE_BIAS, j]
-                + couple[1 + i, 1] * m[FORCE_BIAS + 1, j]
-                + couple[1 + i, 2] * m[FORCE_BIAS + 2, j]
+    for i in range(3):
+        for j in range(columns):
+            pushed = (
+                turn[i, 0] * m[ATTITUDE, j]
+                + turn[i, 1] * m[ATTITUDE + 1, j]
+                + turn[i, 2] * m[ATTITUDE + 2, j]
+                - dt
+                * (
+                    couple[1 + i, 0] * m[FORCE_BIAS, j]
+                    + couple[1 + i, 1] * m[FORCE_BIAS + 1, j]
+                    + couple[1 + i, 2] * m[FORCE_BIAS + 2, j]
+                )
             )
             m[POSITION + i, j] += dt * (m[VELOCITY + i, j] + 0.5 * pushed)
             m[VELOCITY + i, j] += pushed
-            for axis in range(3):
-                m[ATTITUDE + i, j] -= couple[1 + i, axis] * read[axis]
+    for i in range(3):
+        for j in range(columns):
+            m[ATTITUDE + i, j] -= (
+                couple[1 + i, 0] * read[0, j] + couple[1 + i, 1] * read[1, j] + couple[1 + i, 2] * read[2, j]
+            )
             m[FIX_POSITION + i, j] = keep[0] * m[FIX_POSITION + i, j] + keep[1] * m[FIX_VELOCITY + i, j]
             m[FIX_VELOCITY + i, j] *= keep[2]
+    for j in range(columns):
         m[TILT, j] *= keep[3]
         m[TILT + 1, j] *= keep[3]
         m[HEADING, j] *= keep[4]
@@ -131,33 +149,35 @@ def _forward_rows(m: Any, dt: float, couple: Any, keep: Any) -> None:
 def _backward_rows(m: Any, dt: float, couple: Any, keep: Any) -> None:
     """Transposed transition of the columns of m, in place: m <- transition.T @ m."""
     columns = m.shape[1]
-    fx, fy, fz = couple[0, 0], couple[0, 1], couple[0, 2]
     for j in range(columns):
         m[TILT, j] *= keep[3]
         m[TILT + 1, j] *= keep[3]
         m[HEADING, j] *= keep[4]
-        for i in range(3):
+    # what a push does to velocity and position, and what a reading of the gyros does to the attitude
+    push, swung = np.empty((3, columns)), np.empty((3, columns))
+    for i in range(3):
+        for j in range(columns):
             m[FIX_VELOCITY + i, j] = keep[2] * m[FIX_VELOCITY + i, j] + keep[1] * m[FIX_POSITION + i, j]
             m[FIX_POSITION + i, j] *= keep[0]
-        # what a push does to velocity and position
-        push = (
-            m[VELOCITY, j] + 0.5 * dt * m[POSITION, j],
-            m[VELOCITY + 1, j] + 0.5 * dt * m[POSITION + 1, j],
-            m[VELOCITY + 2, j] + 0.5 * dt * m[POSITION + 2, j],
-        )
-        a, b, c = m[ATTITUDE, j], m[ATTITUDE + 1, j], m[ATTITUDE + 2, j]
-        for axis in range(3):
-            m[FORCE_BIAS + axis, j] -= dt * (
-                couple[1, axis] * push[0] + couple[2, axis] * push[1] + couple[3, axis] * push[2]
+            push[i, j] = m[VELOCITY + i, j] + 0.5 * dt * m[POSITION + i, j]
+            swung[i, j] = (
+                couple[1, i] * m[ATTITUDE, j] + couple[2, i] * m[ATTITUDE + 1, j] + couple[3, i] * m[ATTITUDE + 2, j]
             )
-            swung = couple[1, axis] * a + couple[2, axis] * b + couple[3, axis] * c
-            m[GYRO_BIAS + axis, j] -= dt * swung
-            for i in range(3):
-                m[GYRO_MATRIX + 3 * axis + i, j] -= couple[4, i] * swung
-            m[VELOCITY + axis, j] += dt * m[POSITION + axis, j]
-        m[ATTITUDE, j] += fy * push[2] - fz * push[1]
-        m[ATTITUDE + 1, j] += fz * push[0] - fx * push[2]
-        m[ATTITUDE + 2, j] += fx * push[1] - fy * push[0]
+    for i in range(3):
+        row = GYRO_MATRIX + 3 * i
+        for j in range(columns):
+            m[FORCE_BIAS + i, j] -= dt * (
+                couple[1, i] * push[0, j] + couple[2, i] * push[1, j] + couple[3, i] * push[2, j]
+            )
+            m[GYRO_BIAS + i, j] -= dt * swung[i, j]
+            m[row, j] -= couple[4, 0] * swung[i, j]
+            m[row + 1, j] -= couple[4, 1] * swung[i, j]
+            m[row + 2, j] -= couple[4, 2] * swung[i, j]
+            m[VELOCITY + i, j] += dt * m[POSITION + i, j]
+    for j in range(columns):
+        m[ATTITUDE, j] += couple[0, 1] * push[2, j] - couple[0, 2] * push[1, j]
+        m[ATTITUDE + 1, j] += couple[0, 2] * push[0, j] - couple[0, 0] * push[2, j]
+        m[ATTITUDE + 2, j] += couple[0, 0] * push[1, j] - couple[0, 1] * push[0, j]
 
 
 @njit(cache=True, nogil=True)

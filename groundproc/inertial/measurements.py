@@ -245,13 +245,13 @@ class Builder:
         turning = low_pass(rates, 0.5, 1e9 / r.step_ns)[node]
         # in a turn only the rear axle goes where the car points
         straight = (np.hypot(*velocity[:, :2].T) > 1.5) & (np.linalg.norm(turning, axis=1) < np.deg2rad(4.0))
-        node, velocity = node[straight], velocity[straight]
         heading, _, _ = frames.attitude_of(frames.mat_from_quat(reference.quat[node]))
         right, ahead = np.stack([np.cos(heading), -np.sin(heading)]), np.stack([np.sin(heading), np.cos(heading)])
         sideways, speed = (right.T * velocity[:, :2]).sum(axis=1), (ahead.T * velocity[:, :2]).sum(axis=1)
         # a turn to the left by an angle lets the same velocity be more to the right
         columns = [(VELOCITY, right[0]), (VELOCITY + 1, right[1]), (ATTITUDE + 2, speed), (COURSE, speed)]
-        rows.add("course", node, columns, -sideways, model.sideways_m_s)
+        # those of turns stay, and count for nothing: the rows are the same ones in every iteration
+        rows.add("course", node, columns, -sideways, np.where(straight, model.sideways_m_s, 1e3))
 
     def _outside(self, rows: _Rows, reference: Reference, rates: Array) -> None:
         for fixes in self._readings.outside:

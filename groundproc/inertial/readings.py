@@ -198,7 +198,10 @@ def _thinned(time_s: Array, rate_hz: float) -> Times:
 def _autopilot_imu(boot: Boot, seconds: Callable[[Times], Array]) -> tuple[Samples | None, Samples | None]:
     """The autopilot's gyros [rad/s] and accelerometers [m/s^2] in the ins frame: the message that has most of both."""
     gyros = {track.name: track for track in boot.gyros()}
-    best = max(gyros.values(), key=lambda track: (track.name in _IMU_MESSAGES, len(track.time_ns)), default=None)
+    # an IMU's own message unless another brings the same gyros much oftener
+    best = max(
+        gyros.values(), key=lambda track: len(track.time_ns) * (1.5 if track.name in _IMU_MESSAGES else 1.0), default=None
+    )
     gyro = None if best is None else Samples(best.name, seconds(best.time_ns), best.rate_rad_s)
     forces = [name for name in _IMU_MESSAGES if boot.has(name, 30)]
     if not forces:
@@ -313,8 +316,17 @@ def drives(readings: Readings) -> bool:
     sideways = gained[:, 0] * np.cos(heading) - gained[:, 1] * np.sin(heading)
     felt = low_pass(readings.force.mean[:, :1], 0.5, rate_hz)[:, 0]
     moving = np.hypot(*velocity.T) > 1.0
+    astray = np.abs(frames.quat_log(_about_up(np.arctan2(velocity[:, 0], velocity[:, 1]) - heading))[:, 2])
+    if not moving.any() or np.quantile(astray[moving], 0.9) > np.deg2rad(25.0):
+        return False
     sideways, felt = sideways[moving], felt[moving]
     if len(felt) < 5 * rate_hz or np.sqrt(np.mean(sideways**2)) < 0.25:
         return False
     slope = np.mean((sideways - sideways.mean()) * (felt - felt.mean())) / np.var(sideways)
     return bool(slope > 0.5)
+
+
+def _about_up(angle_rad: Array) -> Array:
+    """Quaternions of turns about the upward axis, shape (n, 4)."""
+    zero = np.zeros_like(angle_rad)
+    return frames.quat_exp(np.stack([zero, zero, angle_rad], axis=1))

@@ -332,11 +332,11 @@ def _corrected(reference: Reference, correction: Array) -> Reference:
 
 
 _LEARNT: Final = {
-    "fix position": ("fix_noise_m", 0.02, 1.0),
-    "fix velocity": ("fix_velocity_noise_m_s", 0.02, 1.0),
+    "fix position": ("fix_noise_m", 0.02, 5.0),
+    "fix velocity": ("fix_velocity_noise_m_s", 0.02, 3.0),
     "tilt": ("tilt_noise_rad", np.deg2rad(0.02), np.deg2rad(2.0)),
     "heading": ("heading_noise_rad", np.deg2rad(0.02), np.deg2rad(5.0)),
-    "barometer": ("baro_noise_m", 0.05, 2.0),
+    "barometer": ("baro_noise_m", 0.05, 5.0),
 }
 """White noise that the residuals tell: field of Model, least, most."""
 
@@ -366,8 +366,8 @@ def _learnt(
             changed[name] = float(np.clip(1.4826 * np.median(np.abs(chosen)), least, most))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     for name, part, least, most in (
-        ("tilt_rad", slice(TILT, TILT + 2), np.deg2rad(0.2), np.deg2rad(5.0)),
-        ("heading_rad", slice(HEADING, HEADING + 1), np.deg2rad(0.3), np.deg2rad(10.0)),
+        ("tilt_rad", slice(TILT, TILT + 2), np.deg2rad(0.2), np.deg2rad(10.0)),
+        ("heading_rad", slice(HEADING, HEADING + 1), np.deg2rad(0.3), np.deg2rad(20.0)),
     ):
         expected = np.square(states[:, part]) + variance[:, part]
         changed[name] = float(np.clip(np.sqrt(expected.mean()), least, most))
