@@ -164,7 +164,7 @@ class Synchroniser:
         try:
             leg = timeline.legs([run], [boot], self._mat, how)[0]
             self._found = [tie_of(leg, self._mat, run.line.device_ns(run.last_receive_ns))]
-        except SwathError as error:
+        except (SwathError, np.linalg.LinAlgError) as error:
             self._found = [str(error)]
 
     def _accept(self, now_s: float) -> bool:

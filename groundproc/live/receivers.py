@@ -27,6 +27,8 @@ _MOST: Final = 512
 _PAUSE_S: Final = 0.004
 """Between two looks: a wake-up for each of 1,808 packets a second would cost more than all else here."""
 _RETRY_S: Final = 1.0
+_OTHER_S: Final = 10.0
+"""After so long a silence another sender is taken for the lidar."""
 _BAUDS: Final = {
     int(name[1:]): getattr(termios, name) for name in dir(termios) if name.startswith("B") and name[1:].isdecimal()
 }
@@ -58,6 +60,7 @@ class Port:
         self.topic, self.drops, self._clock, self._size = topic, 0, clock, size
         self.rejected = 0
         self.sender: str | None = None
+        self._heard_s = -_OTHER_S
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
         try:
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -93,11 +96,16 @@ class Port:
     def _is_wanted(self, data: bytes, sender: str) -> bool:
         if self._size is None:
             return True
-        if len(data) == self._size and self.sender is None:
-            self.sender = sender
-        if len(data) != self._size or sender != self.sender:
+        if len(data) != self._size:
             self.rejected += 1
             return False
+        now_s = time.monotonic()
+        if sender != self.sender and now_s - self._heard_s > _OTHER_S:
+            self.sender = sender
+        if sender != self.sender:
+            self.rejected += 1
+            return False
+        self._heard_s = now_s
         return True
 
     def _stamp_ns(self, notes: list[tuple[int, int, bytes]]) -> int:
