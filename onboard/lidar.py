@@ -293,6 +293,8 @@ class LidarPort(Worker):
             index = 0
         for batch in (self._data, self._position):
             batch.receiver.filter(interface=index)
+        if not index and self._interface != 0:
+            _log.error("network interface %s is not there, and only what comes by it is let in", self._only_interface)
         self._interface = index
 
     def _watch_sensor(self, now_ns: int) -> None:

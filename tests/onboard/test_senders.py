@@ -217,7 +217,9 @@ def test_the_addresses_of_new_firmware_are_heard_and_broadcasts_of_others_refuse
 
 
 @pytest.mark.root
-def test_the_lidars_own_address_by_another_interface_is_refused_and_the_interface_may_come_late() -> None:
+def test_the_lidars_own_address_by_another_interface_is_refused_and_the_interface_may_come_late(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     needs_namespaces()
     lidar_address, forged = "192.168.1.201", packet(7, mark=66)
     with cable(["192.168.1.10/24"], [f"{lidar_address}/24"]) as (aboard, sensor):
@@ -244,6 +246,9 @@ def test_the_lidars_own_address_by_another_interface_is_refused_and_the_interfac
             head(0, 10)  # by the right cable, but the interface has another name yet
             time.sleep(0.3)
             assert port.marks() == {}
+            assert (
+                caplog.messages.count("network interface lidar0 is not there, and only what comes by it is let in") == 1
+            )
             run("ip", "-n", aboard, "link", "set", "late0", "down")
             run("ip", "-n", aboard, "link", "set", "late0", "name", "lidar0")
             run("ip", "-n", aboard, "link", "set", "lidar0", "up")
