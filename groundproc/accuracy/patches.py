@@ -25,6 +25,8 @@ STEEPEST: Final = 0.1
 """Vertical component of a facade's normal, at most."""
 NOT_FACADE: Final = ("glass", "indoors", "reveals", "leaves")
 """Words in the names of surfaces that are no wall: windows, what is seen through them, and leaves."""
+STEEPEST_LEAN: Final = np.tan(np.deg2rad(30.0))
+"""Slope of a fitted plane against the true wall up to which its lean makes the wall no thicker."""
 TRIMMED: Final = 0.1
 """Share of patches left out at either end of the mean."""
 
@@ -162,7 +164,8 @@ def thickness_m(moments: Moments, number: int) -> Array:
     across, inside = covariance[:, 1:, :1], covariance[:, 1:, 1:]
     slope = np.linalg.solve(inside, across) if len(inside) else across
     left = covariance[:, 0, 0] - (slope * across).sum(axis=(1, 2))
-    return np.asarray(np.sqrt(np.maximum(left / (1.0 + np.square(slope).sum(axis=(1, 2))), 0.0)))
+    lean = np.minimum(np.square(slope).sum(axis=(1, 2)), STEEPEST_LEAN**2)
+    return np.asarray(np.sqrt(np.maximum(left / (1.0 + lean), 0.0)))
 
 
 def trimmed_mean(values: Array) -> float:
