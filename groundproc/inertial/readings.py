@@ -29,6 +29,8 @@ STEP_NS: Final = 10 * NS_PER_MS
 """Of the nodes with the lidar's 200 Hz, and without."""
 THINNED_HZ: Final = {"fixes": 10.0, "attitude": 25.0, "baro": 5.0}
 """Stated values that come faster are thinned out: their errors are the same ones."""
+LONGEST_FIX_GAP_NS: Final = 1_500_000_000
+"""Silence of the receiver from which the autopilot's position is dead reckoning."""
 RECOVERY_S: Final = 10.0
 """How long after an outage an autopilot's position is still on its way back to the fixes."""
 UNKNOWN_RATE_DENSITY: Final = np.deg2rad(5.0) ** 2 * 0.2
@@ -200,7 +202,9 @@ def _autopilot_imu(boot: Boot, seconds: Callable[[Times], Array]) -> tuple[Sampl
     gyros = {track.name: track for track in boot.gyros()}
     # an IMU's own message unless another brings the same gyros much oftener
     best = max(
-        gyros.values(), key=lambda track: len(track.time_ns) * (1.5 if track.name in _IMU_MESSAGES else 1.0), default=None
+        gyros.values(),
+        key=lambda track: len(track.time_ns) * (1.5 if track.name in _IMU_MESSAGES else 1.0),
+        default=None,
     )
     gyro = None if best is None else Samples(best.name, seconds(best.time_ns), best.rate_rad_s)
     forces = [name for name in _IMU_MESSAGES if boot.has(name, 30)]
@@ -223,12 +227,15 @@ def _with_fix(boot: Boot, fixes: PositionFixes) -> Mask:
     kept = np.ones(len(fixes.time_ns), np.bool_)
     if not boot.has("GPS_RAW_INT", 1) or fixes.source == "GPS_RAW_INT":
         return kept
-    stamp_ns, lost = boot.stamps_ns["GPS_RAW_INT"], boot.tables["GPS_RAW_INT"]["fix_type"] < 3
-    row = np.clip(np.searchsorted(stamp_ns, fixes.time_ns, side="right") - 1, 0, len(stamp_ns) - 1)
-    kept = ~lost[row]
-    # the receiver's messages are few: the one after may be the first without a fix
-    kept &= ~lost[np.minimum(row + 1, len(stamp_ns) - 1)]
-    for end_ns in stamp_ns[np.flatnonzero(lost[:-1] & ~lost[1:]) + 1]:
+    # while a receiver has no fix it repeats the last one with its old stamp, or none
+    good_ns = boot.stamps_ns["GPS_RAW_INT"][boot.tables["GPS_RAW_INT"]["fix_type"] >= 3]
+    if len(good_ns) < 2:
+        return kept
+    steps = np.diff(good_ns)
+    longest = max(LONGEST_FIX_GAP_NS, round(3.0 * float(np.median(steps))))
+    row = np.searchsorted(good_ns, fixes.time_ns, side="right") - 1
+    kept = (row >= 0) & (fixes.time_ns - good_ns[np.maximum(row, 0)] <= longest)
+    for end_ns in good_ns[1:][steps > longest]:
         kept &= ~((fixes.time_ns >= end_ns) & (fixes.time_ns < end_ns + RECOVERY_S * NS_PER_S))
     return kept if kept.sum() >= 2 else np.ones(len(kept), np.bool_)
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.errors import LogError
+from groundproc.geodesy import LocalFrame
 from groundproc.inertial.model import (
     ATTITUDE,
     COMPASS,
@@ -68,7 +69,7 @@ def filtered_estimate(given: Given, progress: Progress, outside: Sequence[Outsid
             continue
         reports.append({"boot": leg.boot.number, "lidar_run": leg.run} | report(solution))
         warnings += _warnings(solution)
-        part = trajectory_of(given, solution)
+        part = trajectory_in(given.frame, solution)
         # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
         if number and placed[number - 1].boot is leg.boot and parts:
             part = part.after(int(parts[-1].time_ns[-1]))
@@ -105,13 +106,13 @@ def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[Ou
     return solve(readings)
 
 
-def trajectory_of(given: Given, solution: Solution) -> Trajectory:
-    """The trajectory of a solution, with its sigmas."""
+def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
+    """The trajectory of a solution, with its sigmas; `frame` is that of its readings."""
     position, attitude = sigmas(solution)
     kept_s = (solution.kept_ns - solution.time_ns[0]) * 1e-9
     nodes_s = (solution.time_ns - solution.time_ns[0]) * 1e-9
     return Trajectory(
-        frame=given.frame,
+        frame=frame,
         time_ns=solution.time_ns,
         position_m=solution.position_m,
         velocity_m_s=solution.velocity_m_s,
