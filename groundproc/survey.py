@@ -25,7 +25,7 @@ class Survey:
         "for height: ellipsoid where the autopilot does not state both heights: the geoid's height above the ellipsoid "
         "there [m], or a grid file that PROJ reads (.gtx, .tif)",
     )
-    method: str = option("ins", "how the trajectory is made", choices=("ins", "dynamic", "adjusted"))
+    method: str = option("ins", "how the trajectory is made", choices=("ins", "dynamic", "filtered", "adjusted"))
     causal: bool = option(False, "adjusted: use nothing of the future, as in flight")
     dynamic: DynamicOptions = option(DynamicOptions, "method dynamic: trims once per revolution of the scanner")
     compass: str | None = option(

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the products")
     parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
-    parser.add_argument("--method", choices=("ins", "dynamic", "adjusted"), help="how the trajectory is made")
+    parser.add_argument("--method", choices=("ins", "dynamic", "filtered", "adjusted"), help="how the trajectory is made")
     parser.add_argument(
         "--causal", action="store_true", default=None, help="adjusted: use nothing of the future, as in flight"
     )

@@ -8,7 +8,7 @@ import numpy as np
 from flightlog.errors import LogError
 from groundproc.adjustment import adjusted
 from groundproc.calibration import dynamic
-from groundproc.trajectory import ins
+from groundproc.trajectory import filtered, ins
 from groundproc.trajectory.method import Estimate, Given, Progress
 from groundproc.trajectory.trajectory import Trajectory, joined
 
@@ -62,5 +62,6 @@ def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
 METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
     "ins": ins_estimate,
     "dynamic": dynamic_estimate,
+    "filtered": filtered.filtered_estimate,
     "adjusted": adjusted_estimate,
 }
