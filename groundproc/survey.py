@@ -29,7 +29,13 @@ class Survey:
     causal: bool = option(False, "adjusted: use nothing of the future, as in flight")
     dynamic: DynamicOptions = option(DynamicOptions, "method dynamic: trims once per revolution of the scanner")
     compass: str | None = option(
-        None, "method dynamic: a compass model to begin with, from `swath compass`, looked for beside this file; null: none"
+        None,
+        "method dynamic: a compass model to begin with, from `swath compass`, looked for beside this file; null: none",
+    )
+    positions: str | None = option(
+        None,
+        "method filtered: a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), looked for beside this file; "
+        "null: none",
     )
     pose_grid_ms: float | None = option(
         None,

@@ -19,7 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the products")
     parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
-    parser.add_argument("--method", choices=("ins", "dynamic", "filtered", "adjusted"), help="how the trajectory is made")
+    parser.add_argument(
+        "--method", choices=("ins", "dynamic", "filtered", "adjusted"), help="how the trajectory is made"
+    )
     parser.add_argument(
         "--causal", action="store_true", default=None, help="adjusted: use nothing of the future, as in flight"
     )
@@ -38,6 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sync", choices=("auto", "gyro", "host"), help="how the clocks are tied; default: auto")
     parser.add_argument("--fov", metavar="A-B", help="azimuths kept, clockwise, in degrees, or all; default: 255-105")
+    parser.add_argument(
+        "--positions", type=Path, metavar="FILE", help="a better GNSS solution or poses, for method filtered"
+    )
     parser.add_argument("--compass", type=Path, metavar="FILE", help="compass model that method dynamic begins with")
     parser.add_argument(
         "--trajectory", type=Path, metavar="CSV", help="poses from elsewhere, in place of the autopilot's"
@@ -76,8 +81,9 @@ def _survey(arguments: argparse.Namespace) -> Survey:
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())
     if isinstance(tree["mount"], str):
         tree["mount"] = str(arguments.config.parent / tree["mount"])
-    if tree["compass"] is not None:
-        tree["compass"] = str(arguments.config.parent / tree["compass"])
+    for name in ("compass", "positions"):
+        if tree[name] is not None:
+            tree[name] = str(arguments.config.parent / tree[name])
     given = {
         "crs": arguments.crs,
         "method": arguments.method,
@@ -89,6 +95,7 @@ def _survey(arguments: argparse.Namespace) -> Survey:
         "fov_deg": arguments.fov and list(field_of_view(arguments.fov)),
         "mount": arguments.mount and str(arguments.mount),
         "compass": arguments.compass and str(arguments.compass),
+        "positions": arguments.positions and str(arguments.positions),
     }
     return config.from_mapping(tree | {k: v for k, v in given.items() if v is not None}, Survey, "command line")
 

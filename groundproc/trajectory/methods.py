@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from flightlog.errors import LogError
+from flightlog.errors import LogError, UsageError
 from groundproc.adjustment import adjusted
 from groundproc.calibration import dynamic
 from groundproc.trajectory import filtered, ins
@@ -14,7 +14,18 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 
 
 def estimate(given: Given, progress: Progress) -> Estimate:
-    """Make the trajectory with the method that the survey chose."""
+    """Make the trajectory with the method that the survey chose.
+
+    Raises
+    ------
+    UsageError
+        Positions are given that the method would not look at.
+    """
+    survey = given.survey
+    if survey.positions is not None and survey.method != "filtered":
+        raise UsageError(
+            f"positions: {survey.positions} given, but only method filtered uses them, not {survey.method}"
+        )
     return METHODS[given.survey.method](given, progress)
 
 
