@@ -23,7 +23,8 @@ Array = npt.NDArray[np.float64]
 BINS: Final = 36
 """Sectors of heading; a run gives one value for each that it went through: its trims there are not independent of each other."""
 PRIOR_DEG: Final = 15.0
-"""What harmonics are before anything is known, one sigma: holds them where few headings were seen [deg]."""
+"""What the first harmonic is before anything is known, one sigma [deg]; the others less with the square of their order. Holds them where
+few headings were seen: four streets at right angles cannot tell the second from nothing."""
 LEAST_SCATTER_DEG: Final = 0.1
 """No run is believed to be better than this [deg]."""
 HUBER: Final = 1.5
@@ -101,7 +102,8 @@ def fit_compass(runs: Sequence[Run], harmonics: int = 2) -> CompassCurve:
         )
     size = 1 + 2 * harmonics
     design = _design(heading, size)
-    prior = np.diag([0.0] + [PRIOR_DEG**-2] * (size - 1))
+    orders = np.repeat(np.arange(1, harmonics + 1), 2)
+    prior = np.diag(np.concatenate([[0.0], (orders**2 / PRIOR_DEG) ** 2]))
     weight, scatter = np.ones(len(observed)), 1.0
     coefficients = np.zeros(size)
     for _ in range(ROUNDS):

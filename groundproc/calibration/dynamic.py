@@ -31,6 +31,9 @@ Method = Callable[[Given, Progress], Estimate]
 SETTLED_S: Final = 5.0
 """Yaw trims of the first seconds are not of the compass yet: the source's settle in 2 to 5 s [s]."""
 
+STRAIGHT_S: Final = 2.0
+STRAIGHT_RAD: Final = np.deg2rad(5.0)
+"""Trims are believed where the heading has changed by less than this over so long."""
 WORSE: Final = 1.02
 """Trims that make the revolutions fit each other worse than this ratio are not applied; where there is nothing to see it is 1 and noise."""
 
@@ -96,9 +99,13 @@ def with_compass(trajectory: Trajectory, curve: CompassCurve) -> Trajectory:
 
 
 def settled_run(path: Path) -> Run:
-    """The yaw trims of a trims.csv, without the first seconds."""
+    """The yaw trims of a trims.csv, without the first seconds and without turns, in which they lag behind."""
     time_ns, heading, yaw = read_yaw(path)
-    settled = time_ns >= (time_ns[0] if len(time_ns) else 0) + round(SETTLED_S * 1e9)
+    if len(time_ns) == 0:
+        return Run(heading, yaw)
+    seconds, course = (time_ns - time_ns[0]) * 1e-9, np.unwrap(heading)
+    turned = np.abs(course - np.interp(seconds - STRAIGHT_S, seconds, course))
+    settled = (seconds >= SETTLED_S) & (turned < STRAIGHT_RAD)
     return Run(heading[settled], yaw[settled])
 
 
