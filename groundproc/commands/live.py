@@ -116,7 +116,10 @@ def run(arguments: argparse.Namespace) -> int:
                         signal.signal(number, handler)
         finally:
             source.close()
-    print(_report(summary, points, folder), file=sys.stderr if arguments.json else sys.stdout)
+    print(
+        _report(summary, points, folder, arguments.follow is not None),
+        file=sys.stderr if arguments.json else sys.stdout,
+    )
     return 0
 
 
@@ -206,10 +209,11 @@ def status_line(status: dict[str, Any]) -> str:
     return "; ".join(parts)
 
 
-def _report(summary: Summary, points: int, folder: Path) -> str:
+def _report(summary: Summary, points: int, folder: Path, follows: bool) -> str:
     if not summary.places:
         return f"no pose in {summary.seconds:.0f} s: {summary.status['state']}"
+    late = "" if follows else f", at worst {summary.worst_lag_s:.2f} s behind"
     return (
-        f"\n{summary.places / 10:.1f} s of flight in {folder / 'trajectory_live.csv'}, at worst {summary.worst_lag_s:.2f} s behind; "
+        f"\n{summary.places / 10:.1f} s of flight in {folder / 'trajectory_live.csv'}{late}; "
         f"{points:,} points in {folder / 'cloud_live.laz'}"
     )

@@ -108,7 +108,7 @@ class Inbox:
     def put(self, item: Received) -> None:
         """Add what was received."""
         with self._changed:
-            limit = LARGEST_BYTES // 8 if self.waits else LARGEST_BYTES
+            limit = LARGEST_BYTES // 32 if self.waits else LARGEST_BYTES
             while self.waits and self._bytes > limit and not self.ended:
                 self._changed.wait(0.2)
             self._items.append(item)
