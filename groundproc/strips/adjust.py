@@ -6,19 +6,24 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from groundproc.adjustment.batch import DEFLATION
 from groundproc.adjustment.factors import Factor, Unknowns
-from groundproc.adjustment.solve import Problem, problem
 from groundproc.strips.correction import Correction
 from groundproc.strips.options import AUTO, FREE, StripOptions
 from groundproc.strips.rows import ROUGHNESS_M, Bordered, bordered
 
 Array = npt.NDArray[np.float64]
 
-DRAWS: Final = 24
-"""Draws from the posterior that the sigmas are from: right to a seventh."""
+AT_KNOT: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
+"""Weights of a uniform cubic B-spline at a knot."""
+MOST_INTERVALS: Final = 660
+"""Intervals between knots: 4000 unknowns, a matrix of 128 MB. Longer flights get knots farther apart."""
 COARSEST_M: Final = 16.0
+MOST_STEPS: Final = 8
+SETTLED: Final = 0.02
+"""Steps end where the last one changes less than this part of the prior sigmas."""
 _TOLD: Final = 0.5
 """A constant is estimated where the strips leave less than this part of its prior sigma."""
 
@@ -37,88 +42,44 @@ class Sigmas:
     attitude_rad: float
 
 
-@dataclass(slots=True)
 class Linear:
-    """The linear problem of a step with its border."""
+    """The linear problem of a step, dense: the splines of a flight have some thousand unknowns, and every soft mode counts.
 
-    base: Problem
-    rows: Bordered
-    border: Array
-    block: Array
-    factors: list[Factor]
-    gradient: Array
+    Parameters
+    ----------
+    rows : Bordered
+    factors : list of Factor
+    """
 
-    @classmethod
-    def of(cls, rows: Bordered, factors: list[Factor], unknowns: Unknowns) -> "Linear":
-        """Set it up."""
-        base = problem(rows.rows, factors, unknowns, DEFLATION)
-        gradient = base.gradient.copy()
-        gradient[unknowns.path_size :] += rows.projected.T @ rows.rows.residual_m / DEFLATION
-        made = cls(base, rows, rows.border / DEFLATION, rows.block / DEFLATION, factors, gradient)
-        base.factor = _Blocks(
-            base.factor, made.block + base.normal[unknowns.path_size :, unknowns.path_size :].toarray()
-        )
-        return made
-
-    def solve(self, right: Array, enough: float = 1e-5) -> tuple[Array, int]:
-        """Normal matrix x = right."""
-        return _Solver(self).solve(right, enough)
-
-    def draws(self, count: int, seed: int = 1) -> Array:
-        """Draws from the posterior about the solution, shape (count, unknowns)."""
-        rng = np.random.default_rng(seed)
-        weight = self.rows.rows.weight
-        found = np.empty((count, len(self.gradient)))
-        for i in range(count):
-            noise = np.where(weight > 0, rng.standard_normal(len(weight)) / np.sqrt(np.maximum(weight, 1e-30)), 0.0)
-            right = self.rows.right(noise) / np.sqrt(DEFLATION)
-            for factor in self.factors:
-                right += factor.matrix.T @ (rng.standard_normal(len(factor.sigma)) / factor.sigma)
-            found[i], _ = self.solve(right, 1e-3)
-        return found
-
-    def covariance_of_constants(self) -> Array:
-        """Exactly, shape (m, m): columns of the inverse."""
-        count = len(self.block)
-        start = len(self.gradient) - count
-        columns = np.empty((count, count))
-        for i in range(count):
-            right = np.zeros(len(self.gradient))
-            right[start + i] = 1.0
-            columns[i] = self.solve(right, 1e-6)[0][start:]
-        return np.asarray(0.5 * (columns + columns.T))
-
-
-class _Blocks:
-    """Preconditioner: that of the splines, and the constants' own block."""
-
-    def __init__(self, splines: Any, block: Array) -> None:
-        self._splines, self._block = splines, np.linalg.inv(block)
+    def __init__(self, rows: Bordered, factors: list[Factor]) -> None:
+        self.names = rows.names
+        matrix = rows.normal() / DEFLATION
+        gradient = rows.right(rows.rows.residual_m) / DEFLATION
+        for factor in factors:
+            weighted = sparse.diags(1.0 / factor.sigma) @ factor.matrix
+            product = (weighted.T @ weighted).tocoo()
+            np.add.at(matrix, (product.row, product.col), product.data)
+            gradient += weighted.T @ (factor.residual / factor.sigma)
+        self._lower = cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+        self.gradient = gradient
 
     def solve(self, right: Array) -> Array:
-        """Apply it."""
-        out = np.asarray(self._splines.solve(right))
-        if count := len(self._block):
-            out[-count:] = self._block @ right[-count:]
-        return out
+        """Normal matrix x = right."""
+        return np.asarray(cho_solve((self._lower, True), right, check_finite=False))
 
+    def sigma(self, functionals: Array) -> Array:
+        """Posterior sigma of linear functions of the unknowns, shape (m,), given as columns, shape (unknowns, m)."""
+        back = solve_triangular(self._lower, functionals, lower=True, check_finite=False)
+        return np.asarray(np.sqrt(np.einsum("nm,nm->m", back, back)))
 
-class _Solver(Problem):
-    """The conjugate gradients of `Problem` with the border added."""
-
-    def __init__(self, linear: Linear) -> None:
-        base = linear.base
-        super().__init__(base.rows, base.deflation, base.normal, base.gradient, base.factor)
-        self._linear = linear
-
-    def apply(self, vector: Array) -> Array:
-        """The whole normal matrix times a vector."""
-        out = super().apply(vector)
-        border, block = self._linear.border, self._linear.block
-        if count := len(block):
-            out[: len(border)] += border @ vector[-count:]
-            out[-count:] += border.T @ vector[: len(border)] + block @ vector[-count:]
-        return out
+    def constant_sigmas(self) -> dict[str, Array]:
+        """Posterior sigma of each constant, shape (3,) each."""
+        size = len(self.gradient)
+        start = size - 3 * len(self.names)
+        columns = np.zeros((size, size - start))
+        columns[start:] = np.eye(size - start)
+        deviation = self.sigma(columns)
+        return {name: deviation[place] for name, place in self.names.items()}
 
 
 @dataclass(slots=True)
@@ -146,13 +107,17 @@ class Adjusted:
         intervals = self.correction.intervals
         if self.linear is None:
             return np.full((intervals + 1, 6), np.nan)
-        draws = self.linear.draws(DRAWS)
         size = (intervals + 3) * 6
-        splines = draws[:, :size].reshape(DRAWS, -1, 6)
-        at_knots = (splines[:, :-2] + 4.0 * splines[:, 1:-1] + splines[:, 2:]) / 6.0
-        shift = self.linear.rows.names["shift_m"]
-        at_knots[:, :, 3:] += draws[:, None, size:][:, :, shift]
-        return np.asarray(np.sqrt(np.mean(np.square(at_knots), axis=0)))
+        shift = self.linear.names["shift_m"]
+        out = np.empty((intervals + 1, 6))
+        for axis in range(6):
+            columns = np.zeros((len(self.linear.gradient), intervals + 1))
+            for j, weight in enumerate(AT_KNOT):
+                columns[(np.arange(intervals + 1) + j) * 6 + axis, np.arange(intervals + 1)] = weight
+            if axis >= 3:
+                columns[size + shift.start + axis - 3] = 1.0
+            out[:, axis] = self.linear.sigma(columns)
+        return out
 
 
 def adjust(
@@ -186,23 +151,18 @@ def adjust(
     while edges[-1] > 1.01 * voxel_m:
         edges.append(max(edges[-1] / 2.0, voxel_m))
     log: list[dict[str, float]] = []
-    steps = [(edge, False) for edge in edges] + [(voxel_m, True)] * 2
-    linear, sigma = None, {}
-    for edge, cut in steps:
-        correction, linear = work.step(correction, edge, cut, free, log)
-    if linear is not None and free:
-        sigma = _constant_sigmas(linear)
-        held = [n for n in free if choice[n] == AUTO and (sigma[n] > _TOLD * prior[n]).all()]
-        if held:
-            free = [name for name in free if name not in held]
-            zero = {name: -getattr(correction, name) for name in held}
-            correction = correction.changed(np.zeros_like(correction.coefficients), zero)
-            for edge, cut in [(voxel_m, True)] * 2:
-                correction, linear = work.step(correction, edge, cut, free, log)
-            sigma |= _constant_sigmas(linear) if linear is not None else {}
-    # the posterior is of where the last step arrived
-    if linear is not None:
-        _, linear = work.step(correction, voxel_m, True, free, [])
+    linear: Linear | None = None
+    for edge in edges:
+        correction, linear = work.step(correction, edge, False, free, log)
+    correction, linear = work.settle(correction, voxel_m, free, log)
+    sigma = {} if linear is None else linear.constant_sigmas()
+    held = [n for n in free if choice[n] == AUTO and n in sigma and (sigma[n] > _TOLD * prior[n]).any()]
+    if held:
+        free = [name for name in free if name not in held]
+        zero = {name: -getattr(correction, name) for name in held}
+        correction = correction.changed(np.zeros_like(correction.coefficients), zero)
+        correction, linear = work.settle(correction, voxel_m, free, log)
+        sigma |= {} if linear is None else linear.constant_sigmas()
     constants = {}
     for name in ("boresight_rad", "lever_m"):
         state = "estimated" if name in free and linear is not None else "held"
@@ -211,11 +171,6 @@ def adjust(
             "prior_sigma": prior[name],
         }  # fmt: skip
     return Adjusted(correction, linear, constants, log)
-
-
-def _constant_sigmas(linear: Linear) -> dict[str, Array]:
-    deviation = np.sqrt(np.diag(linear.covariance_of_constants()))
-    return {name: deviation[place] for name, place in linear.rows.names.items()}
 
 
 @dataclass(slots=True)
@@ -227,6 +182,21 @@ class _Work:
     sigmas: Sigmas
     options: StripOptions
     prior: dict[str, float]
+
+    def settle(
+        self, correction: Correction, voxel_m: float, free: list[str], log: list[dict[str, float]]
+    ) -> tuple[Correction, Linear | None]:
+        """Steps with outliers cut until they change little; and the posterior about where they arrived."""
+        for number in range(MOST_STEPS):
+            correction, linear = self.step(correction, voxel_m, True, free, log)
+            if linear is None:
+                return correction, None
+            moved = log[-1]["moved_m"] / self.sigmas.position_m
+            turned = np.deg2rad(log[-1]["turned_deg"]) / self.sigmas.attitude_rad
+            if number and max(moved, turned) < SETTLED:
+                break
+        _, linear = self.step(correction, voxel_m, True, free, [])
+        return correction, linear
 
     def step(
         self, correction: Correction, voxel_m: float, cut: bool, free: list[str], log: list[dict[str, float]]
@@ -245,13 +215,13 @@ class _Work:
             wandering(correction, unknowns, self.sigmas, self.options),
             constant_prior(correction, unknowns),
         ]
-        linear = Linear.of(rows, factors, unknowns)
-        x, count = linear.solve(-linear.gradient)
+        linear = Linear(rows, factors)
+        x = linear.solve(-linear.gradient)
         change = x[: unknowns.path_size].reshape(-1, 6)
         cost, used = rows.rows.cost()
         log.append(
             {
-                "voxel_m": voxel_m, "planes": len(rows.rows.first) - 1, "rows": len(rows.rows), "used": used, "steps": count,
+                "voxel_m": voxel_m, "planes": len(rows.rows.first) - 1, "rows": len(rows.rows), "used": used,
                 "chi_square": cost / max(used, 1), "moved_m": float(np.sqrt(np.mean(np.square(change[:, 3:])) * 3.0)),
                 "turned_deg": float(np.rad2deg(np.sqrt(np.mean(np.square(change[:, :3])) * 3.0))),
             }

@@ -16,7 +16,7 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Points move by p -> s + shift + d(t) + R l + exp(w(t) + R b) (p - s), with scanner s and attitude R as given.
+    """Points move by p -> s + shift + d(t) + exp(w(t)) (R l + exp(R b) (p - s)), with scanner s and attitude R as given.
 
     Attributes
     ----------
@@ -129,31 +129,45 @@ def _move(
     time_ns: Any, arm: Any, quat: Any, start_ns: int, knot_ns: float, coefficients: Any, boresight: Any, lever: Any, shift: Any,
     move: Any, turned: Any,
 ) -> None:  # fmt: skip
-    value, b, l_ = np.empty(6), np.empty(3), np.empty(3)
+    value, turn, offset, x = np.empty(6), np.empty(3), np.empty(3), np.empty(3)
     for n in range(len(time_ns)):
         _value(time_ns[n], start_ns, knot_ns, coefficients, value)
-        w, x, y, z = quat[n, 0], quat[n, 1], quat[n, 2], quat[n, 3]
-        for vector, out in ((boresight, b), (lever, l_)):
-            # q v q*: v + 2 w (u x v) + 2 u x (u x v)
-            cx = y * vector[2] - z * vector[1]
-            cy = z * vector[0] - x * vector[2]
-            cz = x * vector[1] - y * vector[0]
-            out[0] = vector[0] + 2.0 * (w * cx + y * cz - z * cy)
-            out[1] = vector[1] + 2.0 * (w * cy + z * cx - x * cz)
-            out[2] = vector[2] + 2.0 * (w * cz + x * cy - y * cx)
-        vx, vy, vz = value[0] + b[0], value[1] + b[1], value[2] + b[2]
-        square = vx * vx + vy * vy + vz * vz
-        if square < 1e-6:
-            sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
-        else:
-            angle = np.sqrt(square)
-            sine, cosine = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
-        ax, ay, az = np.float64(arm[n, 0]), np.float64(arm[n, 1]), np.float64(arm[n, 2])
-        cx, cy, cz = vy * az - vz * ay, vz * ax - vx * az, vx * ay - vy * ax
-        dx = sine * cx + cosine * (vy * cz - vz * cy)
-        dy = sine * cy + cosine * (vz * cx - vx * cz)
-        dz = sine * cz + cosine * (vx * cy - vy * cx)
-        turned[n, 0], turned[n, 1], turned[n, 2] = ax + dx, ay + dy, az + dz
-        move[n, 0] = dx + value[3] + l_[0] + shift[0]
-        move[n, 1] = dy + value[4] + l_[1] + shift[1]
-        move[n, 2] = dz + value[5] + l_[2] + shift[2]
+        _into_map(quat[n], boresight, turn)
+        _into_map(quat[n], lever, offset)
+        for c in range(3):
+            x[c] = arm[n, c]
+        # what is added, rather than what results: a point that moves by nothing moves by exactly nothing
+        _turned(turn, x, turned[n])
+        for c in range(3):
+            turned[n, c] += offset[c]
+            x[c] += turned[n, c]
+            move[n, c] = turned[n, c] + value[3 + c] + shift[c]
+        _turned(value, x, turned[n])
+        for c in range(3):
+            move[n, c] += turned[n, c]
+            turned[n, c] += x[c]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _into_map(q: Any, v: Any, out: Any) -> None:
+    """A vector of the body along map axes: v + 2 w (u x v) + 2 u x (u x v) with q = (w, u)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    a, b, c = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
+    out[0] = v[0] + 2.0 * (w * a + y * c - z * b)
+    out[1] = v[1] + 2.0 * (w * b + z * a - x * c)
+    out[2] = v[2] + 2.0 * (w * c + x * b - y * a)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turned(v: Any, x: Any, out: Any) -> None:
+    """By how much a rotation vector moves a point: exp(v) x - x (Rodrigues)."""
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if square < 1e-6:
+        sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    else:
+        angle = np.sqrt(square)
+        sine, cosine = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    a, b, c = v[1] * x[2] - v[2] * x[1], v[2] * x[0] - v[0] * x[2], v[0] * x[1] - v[1] * x[0]
+    out[0] = sine * a + cosine * (v[1] * c - v[2] * b)
+    out[1] = sine * b + cosine * (v[2] * a - v[0] * c)
+    out[2] = sine * c + cosine * (v[0] * b - v[1] * a)

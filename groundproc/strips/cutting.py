@@ -1,11 +1,13 @@
 """Strips: stretches of time between which surfaces are compared."""
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
 
 from flightlog import frames
 from groundproc.strips.route import Route
@@ -15,8 +17,9 @@ Ints = npt.NDArray[np.int64]
 
 BIN_NS: Final = 100_000_000
 """Time is looked at in bins of this length."""
-WINDOW_S: Final = 10.0
+WINDOW_S: Final = 6.0
 """A turn is what changes the course within this time."""
+_WIDE_RAD: Final = np.deg2rad(100.0)
 _SLOWEST_M_S: Final = 0.3
 _MIXED: Final = 5
 """More changes than this for each id say that ids do not follow each other in time: tiles, or two scanners at once."""
@@ -129,16 +132,20 @@ class Occupancy:
         course = np.unwrap(course)
         padded = np.pad(course, half, mode="edge")
         change = np.abs(padded[2 * half :] - padded[: -2 * half])
-        turning = np.concatenate([[False], change > np.deg2rad(turn_deg), [False]])
-        edges = np.flatnonzero(np.diff(turning.astype(np.int8)))
-        cuts: list[int] = []
-        for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            # what goes on turning, as on a circle, is cut again and again
-            parts = max(1, (end - start) // (4 * half))
-            for part in range(parts):
-                low, high = start + (end - start) * part // parts, start + (end - start) * (part + 1) // parts
-                cuts.append(low + int(np.argmax(change[low:high])))
-        return np.array(cuts, np.int64)
+        cuts, _ = find_peaks(change, height=np.deg2rad(turn_deg), prominence=np.deg2rad(turn_deg) / 4, distance=half)
+        found = cuts.tolist()
+        # a wide turn or a circle has no peak: what turns in its inner part is cut where the course is half-way
+        left = list(itertools.pairwise([0, *found, bins - 1]))
+        while left:
+            start, end = left.pop()
+            low, high = start + (end - start) // 5, end - (end - start) // 5
+            turned = np.abs(course[low : high + 1] - course[low])
+            if end - start < half or turned[-1] < _WIDE_RAD:
+                continue
+            middle = low + int(np.argmax(turned >= 0.5 * turned[-1]))
+            found.append(middle)
+            left += [(start, middle), (middle, end)]
+        return np.array(sorted(found), np.int64)
 
 
 def headings_differ(route: Route, strips: Strips) -> float:

@@ -19,6 +19,8 @@ FEWEST: Final = 8
 """Points of a strip's plane."""
 _ALIKE: Final = 0.985
 """Cosine between the normals of two planes that are one surface (10 deg)."""
+_MOST: Final = 64
+"""Strips that are compared in one voxel, at most."""
 _LIMIT: Final = 1_500_000
 """Voxels of strips that are kept."""
 
@@ -137,45 +139,52 @@ def _pairs(
 ) -> int:
     """Count pairs of planes of one voxel, and fill them in: difference, normal, place, sigma."""
     found = 0
-    normals, low = np.empty((64, 3)), np.empty(64)
+    normals, low = np.empty((_MOST, 3)), np.empty(_MOST)
     for v in range(len(first) - 1):
-        start, end = first[v], min(first[v + 1], first[v] + 64)
+        start, end = first[v], min(first[v + 1], first[v] + _MOST)
         if end - start < 2:
             continue
         for i in range(start, end):
-            low[i - start] = -1.0
-            if count[i] < FEWEST:
-                continue
-            s = scatter[i] / count[i]
-            least, middle = flattest(
-                np.float64(s[0]), np.float64(s[1]), np.float64(s[2]), np.float64(s[3]), np.float64(s[4]),
-                np.float64(s[5]), normals[i - start],
-            )  # fmt: skip
-            if least < (0.04 + 0.02 * voxel_m) ** 2 and middle > (0.15 * voxel_m) ** 2 and least < 0.15 * middle:
-                low[i - start] = max(least, 1e-8)
+            low[i - start] = _thickness(scatter[i], count[i], voxel_m, normals[i - start])
         for i in range(start, end):
             for j in range(i + 1, end):
                 a, b = i - start, j - start
-                if low[a] < 0.0 or low[b] < 0.0:
-                    continue
                 dot = normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1] + normals[a, 2] * normals[b, 2]
-                if abs(dot) < _ALIKE:
+                if low[a] < 0.0 or low[b] < 0.0 or abs(dot) < _ALIKE:
                     continue
                 if fill:
-                    sign = 1.0 if dot > 0.0 else -1.0
-                    x = normals[a, 0] + sign * normals[b, 0]
-                    y = normals[a, 1] + sign * normals[b, 1]
-                    z = normals[a, 2] + sign * normals[b, 2]
-                    length = np.sqrt(x * x + y * y + z * z)
-                    if (z < 0.0 and abs(z) > 0.1 * length) or (abs(z) <= 0.1 * length and x < 0.0):
-                        length = -length
-                    x, y, z = x / length, y / length, z / length
-                    d = 0.0
-                    for axis, n in ((0, x), (1, y), (2, z)):
-                        d += n * (place[j, axis] - place[i, axis])
-                        value[found, 4 + axis] = 0.5 * (place[i, axis] + place[j, axis])
-                    value[found, 0], value[found, 1], value[found, 2], value[found, 3] = d, x, y, z
+                    _difference(normals[a], normals[b], 1.0 if dot > 0.0 else -1.0, place[i], place[j], value[found])
                     value[found, 7] = np.sqrt(low[a] / count[i] + low[b] / count[j])
                     strips[found, 0], strips[found, 1] = strip[i], strip[j]
                 found += 1
     return found
+
+
+@njit(cache=True, nogil=True)
+def _thickness(scatter: Any, count: int, voxel_m: float, normal: Any) -> Any:
+    """Variance across the plane of some points; negative where they are too few or no plane. `normal` takes its direction."""
+    if count < FEWEST:
+        normal[:] = 0.0
+        return -1.0
+    n = 1.0 / count
+    least, middle = flattest(
+        n * scatter[0], n * scatter[1], n * scatter[2], n * scatter[3], n * scatter[4], n * scatter[5], normal
+    )
+    if least < (0.04 + 0.02 * voxel_m) ** 2 and middle > (0.15 * voxel_m) ** 2 and least < 0.15 * middle:
+        return max(least, 1e-8)
+    return -1.0
+
+
+@njit(cache=True, nogil=True)
+def _difference(normal: Any, other: Any, sign: float, place: Any, later: Any, out: Any) -> None:
+    """Way from a plane to a later one along their mean normal, which points up or, of walls, east; and the middle between them."""
+    x, y, z = normal[0] + sign * other[0], normal[1] + sign * other[1], normal[2] + sign * other[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    wall = abs(z) <= 0.1 * length
+    if (not wall and z < 0.0) or (wall and x < 0.0):
+        length = -length
+    out[1], out[2], out[3] = x / length, y / length, z / length
+    out[0] = 0.0
+    for axis in range(3):
+        out[0] += out[1 + axis] * (later[axis] - place[axis])
+        out[4 + axis] = 0.5 * (place[axis] + later[axis])

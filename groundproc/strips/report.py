@@ -136,6 +136,7 @@ def _tree(facts: Facts, sigma: Array) -> dict[str, Any]:
                 for first, last in zip(strips.first_bin.tolist(), strips.last_bin.tolist(), strict=True)
             ],
         },
+        "knots_s": round(correction.knots_s, 3),
         "voxel_m": round(facts.voxel_m, 3),
         "voxels_kept": facts.share,
         "prior": {"position_sigma_m": facts.sigmas.position_m, "attitude_sigma_deg": float(np.rad2deg(facts.sigmas.attitude_rad))},
@@ -210,9 +211,11 @@ def _draw_differences(path: Path, facts: Facts) -> None:
         figure.colorbar(dots, ax=shown, shrink=0.8)
     edges = np.linspace(-2 * limit, 2 * limit, 101) * 100
     for which, name, colour in ((before, "before", "tab:red"), (after, "after", "tab:blue")):
-        axes[2].hist(np.clip(which.along_m * 100, edges[0], edges[-1]), edges, color=colour, alpha=0.6, label=name)
-    axes[2].set(title="along the normal", xlabel="difference [cm]", ylabel="patches")
-    axes[2].legend()
+        if len(which):
+            value = np.clip(which.along_m * 100, edges[0], edges[-1])
+            axes[2].hist(value, edges, color=colour, alpha=0.6, label=f"{name}: {len(which)} patches", density=True)
+            axes[2].legend()
+    axes[2].set(title="along the normal", xlabel="difference [cm]", ylabel="share of the patches for each cm")
     figure.tight_layout()
     with written_aside(path) as aside:
         figure.savefig(aside, format="png")

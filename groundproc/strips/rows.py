@@ -26,6 +26,8 @@ ROUGHNESS_M: Final = 0.01
 """Roughness of surfaces before their residuals tell, one sigma of a cluster [m]."""
 CONTROL: Final = -2
 """Strip of a control point."""
+MOST_INTERVALS_SEEN: Final = 24
+"""Intervals between knots from which one voxel is taken to be seen, at most."""
 _ROW_CAP: Final = 20.0
 """Points of a cluster that count for the direction of a plane, at most: a stop over one place must not outweigh a pass."""
 
@@ -51,16 +53,16 @@ class Bordered:
     projected: Array
     names: dict[str, slice]
 
-    @property
-    def border(self) -> Array:
-        """Normal matrix between splines and constants, shape (path, m)."""
-        columns = [replace(self.rows, residual_m=self.constants[:, k]).gradient() for k in range(len(self.constants.T))]
-        return np.stack(columns, axis=1) if columns else np.zeros(((self.rows.intervals + 3) * 6, 0))
-
-    @property
-    def block(self) -> Array:
-        """Normal matrix of the constants, shape (m, m)."""
-        return np.asarray(self.constants.T @ self.projected)
+    def normal(self) -> Array:
+        """Lower triangle of the normal matrix of splines and constants, planes taken out, shape (path + m, path + m)."""
+        rows = self.rows
+        size, wide = (rows.intervals + 3) * 6, self.constants.shape[1]
+        out = np.zeros((size + wide, size + wide))
+        _normal(rows.first, rows.knot, rows.weights, rows.jacobian, rows.plane, rows.weight, rows.inverse, out)
+        for k in range(wide):
+            out[size + k, :size] = replace(rows, residual_m=self.constants[:, k]).gradient()
+        out[size:, size:] = self.constants.T @ self.projected
+        return out
 
     def right(self, value: Array) -> Array:
         """Half a gradient for distances, shape (n,), by splines and constants."""
@@ -105,6 +107,7 @@ def bordered(
     size = np.diff(first)
     kept = order[np.repeat(good, size)]
     starts = np.concatenate([[0], np.cumsum(size[good])]).astype(np.int64)
+    kept, starts = _thinned(starts, kept, knot, strip)
     n = len(kept)
     jacobian, plane = np.empty((n, 6), np.float32), np.empty((n, 2), np.float32)
     weight, residual, inverse = np.empty(n), np.empty(n), np.empty((len(starts) - 1, 6))
@@ -210,6 +213,83 @@ def _planes(
 
 
 @njit(cache=True, nogil=True)
+def _thinned(first: Any, rows: Any, knot: Any, strip: Any) -> Any:
+    """Rows of at most `MOST_INTERVALS_SEEN` intervals of each voxel, evenly chosen: a hover sees the same voxels all the time.
+
+    Control points are kept, in whatever interval they stand.
+    """
+    out, starts, count = np.empty(len(rows), np.int64), np.empty(len(first), np.int64), 0
+    for v in range(len(first) - 1):
+        starts[v] = count
+        distinct = 0
+        for i in range(first[v], first[v + 1]):
+            distinct += i == first[v] or knot[rows[i]] != knot[rows[i - 1]]
+        stride, number = (distinct + MOST_INTERVALS_SEEN - 1) // MOST_INTERVALS_SEEN, -1
+        for i in range(first[v], first[v + 1]):
+            number += i == first[v] or knot[rows[i]] != knot[rows[i - 1]]
+            if (number + v) % stride == 0 or strip[rows[i]] == CONTROL:
+                out[count] = rows[i]
+                count += 1
+    starts[-1] = count
+    return out[:count], starts
+
+
+@njit(cache=True, nogil=True)
+def _normal(
+    first: Any, knot: Any, weights: Any, jacobian: Any, plane: Any, weight: Any, inverse: Any, out: Any
+) -> None:
+    """Lower triangle of the normal matrix of the splines: that for known planes, less what finding the planes costs."""
+    most = 4 * (MOST_INTERVALS_SEEN + 1)
+    coefficients, sums = np.empty(most, np.int64), np.empty((most, 6, 3))
+    for v in range(len(first) - 1):
+        used = 0
+        for i in range(first[v], first[v + 1]):
+            k = np.int64(knot[i])
+            # rows are in order of time: what this interval adds to the coefficients comes last
+            new = k if used == 0 else max(coefficients[used - 1] + 1, k)
+            for one in range(new, k + 4):
+                coefficients[used] = one
+                sums[used] = 0.0
+                used += 1
+            at = used - 1
+            while coefficients[at] != k:
+                at -= 1
+            _add_row(weights[i], jacobian[i], plane[i], weight[i], sums[at : at + 4], out[6 * k : 6 * k + 24, 6 * k :])
+        _take_planes(coefficients[:used], sums, inverse[v], out)
+
+
+@njit(cache=True, nogil=True)
+def _add_row(weights: Any, jacobian: Any, plane: Any, weight: float, sums: Any, out: Any) -> None:
+    """Add a row's products with itself, below the diagonal, and with the plane's three columns."""
+    for j in range(4):
+        for c in range(6):
+            value = weight * weights[j] * jacobian[c]
+            sums[j, c, 0] += value
+            sums[j, c, 1] += value * plane[0]
+            sums[j, c, 2] += value * plane[1]
+            for m in range(j + 1):
+                for d in range(6):
+                    out[6 * j + c, 6 * m + d] += value * weights[m] * jacobian[d]
+
+
+@njit(cache=True, nogil=True)
+def _take_planes(coefficients: Any, sums: Any, q: Any, out: Any) -> None:
+    """Take off what finding a voxel's plane costs."""
+    for one in range(len(coefficients)):
+        for c in range(6):
+            s = sums[one, c]
+            x = q[0] * s[0] + q[1] * s[1] + q[2] * s[2]
+            y = q[1] * s[0] + q[3] * s[1] + q[4] * s[2]
+            z = q[2] * s[0] + q[4] * s[1] + q[5] * s[2]
+            here = out[coefficients[one] * 6 + c]
+            for other in range(one + 1):
+                place = coefficients[other] * 6
+                for d in range(6):
+                    t = sums[other, d]
+                    here[place + d] -= x * t[0] + y * t[1] + z * t[2]
+
+
+@njit(cache=True, nogil=True)
 def _linearise(
     first: Any, rows: Any, world: Any, arm: Any, scatter: Any, counts: Any, control: Any, normals: Any, means: Any, voxel_m: float,
     roughness_m: float, cut: bool, jacobian: Any, plane: Any, weight: Any, residual: Any, inverse: Any,
@@ -246,37 +326,41 @@ def _linearise(
         for i in range(first[v], first[v + 1]):
             n = rows[i]
             variance[i] = control[n] ** 2 if control[n] > 0.0 else noise / counts[n]
-        rough, d, a, b = roughness_m**2, 0.0, 0.0, 0.0
-        for attempt in range(3):
-            for i in range(first[v], first[v + 1]):
-                weight[i] = 1.0 / (variance[i] + rough)
-                if attempt > 0:
-                    off = residual[i] - d - a * plane[i, 0] - b * plane[i, 1]
-                    ratio = abs(off) * np.sqrt(weight[i])
-                    if cut and attempt == 2 and ratio > CUT:
-                        weight[i] = 0.0
-                    elif ratio > HUBER:
-                        weight[i] *= HUBER / ratio
-            d, a, b = _plane(first[v], first[v + 1], plane, weight, residual, voxel_m, inverse[v])
-            if attempt == 0:
-                squares, expected, count = 0.0, 0.0, 0
-                for i in range(first[v], first[v + 1]):
-                    off = residual[i] - d - a * plane[i, 0] - b * plane[i, 1]
-                    squares += min(off * off, 25.0 * (variance[i] + rough))
-                    expected += variance[i]
-                    count += 1
-                rough = max(
-                    (4.0 * roughness_m**2 + squares - expected) / (max(count - 3, 0) + 4.0), 0.25 * roughness_m**2
-                )
+        here = slice(first[v], first[v + 1])
+        _weigh(plane[here], variance[here], residual[here], roughness_m**2, cut, voxel_m, weight[here], inverse[v])
 
 
 @njit(cache=True, nogil=True)
-def _plane(start: int, end: int, plane: Any, weight: Any, residual: Any, voxel_m: float, inverse: Any) -> Any:
+def _weigh(
+    plane: Any, variance: Any, residual: Any, rough: float, cut: bool, voxel_m: float, weight: Any, inverse: Any
+) -> None:
+    """Weights of a voxel's rows: by noise, by what the residuals show beyond it, and less where they are far off."""
+    count = len(residual)
+    least, d, a, b = 0.25 * rough, 0.0, 0.0, 0.0
+    for attempt in range(3):
+        for i in range(count):
+            weight[i] = 1.0 / (variance[i] + rough)
+            ratio = abs(residual[i] - d - a * plane[i, 0] - b * plane[i, 1]) * np.sqrt(weight[i])
+            if cut and attempt == 2 and ratio > CUT:
+                weight[i] = 0.0
+            elif attempt > 0 and ratio > HUBER:
+                weight[i] *= HUBER / ratio
+        d, a, b = _plane(plane, weight, residual, voxel_m, inverse)
+        if attempt == 0:
+            squares = 16.0 * least
+            for i in range(count):
+                off = residual[i] - d - a * plane[i, 0] - b * plane[i, 1]
+                squares += min(off * off, 25.0 * (variance[i] + rough)) - variance[i]
+            rough = max(squares / (max(count - 3, 0) + 4.0), least)
+
+
+@njit(cache=True, nogil=True)
+def _plane(plane: Any, weight: Any, residual: Any, voxel_m: float, inverse: Any) -> Any:
     """Offset and tilts of the best plane; `inverse` takes the inverse of its normal matrix."""
     prior = (voxel_m * TILT_PRIOR) ** -2.0
     n00, n01, n02, n11, n12, n22 = 1e-6, 0.0, 0.0, prior, 0.0, prior
     r0, r1, r2 = 0.0, 0.0, 0.0
-    for i in range(start, end):
+    for i in range(len(weight)):
         w, a, b = weight[i], np.float64(plane[i, 0]), np.float64(plane[i, 1])
         n00 += w
         n01 += w * a

@@ -11,10 +11,11 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog import frames
-from flightlog.errors import CaptureError, CoverageError, SwathError, UsageError
+from flightlog.clock import utc_text
+from flightlog.errors import CoverageError, SwathError, UsageError
 from groundproc.files import made_folder
 from groundproc.strips import report
-from groundproc.strips.adjust import COARSEST_M, Adjusted, Sigmas, adjust
+from groundproc.strips.adjust import COARSEST_M, MOST_INTERVALS, Adjusted, Sigmas, adjust
 from groundproc.strips.clouds import Chunk, Clock, Cloud, agreed_crs, chunks, look, rewriters
 from groundproc.strips.clusters import CLUSTER, Gatherer
 from groundproc.strips.control import as_clusters, read_control
@@ -22,7 +23,7 @@ from groundproc.strips.correction import Correction
 from groundproc.strips.cutting import BIN_NS, Occupancy, Strips
 from groundproc.strips.density import Density
 from groundproc.strips.differences import Differences, Patches
-from groundproc.strips.options import StripOptions
+from groundproc.strips.options import HOLD, StripOptions
 from groundproc.strips.route import Route, read_route
 
 Array = npt.NDArray[np.float64]
@@ -105,7 +106,8 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     strips, voxel_m, sigmas = _survey(site, progress)
     clusters, before, share, arm_m = _patches(site, strips, voxel_m, progress)
     start, end = int(site.route.poses.time_ns[0]), int(site.route.poses.time_ns[-1])
-    correction = Correction.none(start, end, task.options.knots_s)
+    knots_s = max(task.options.knots_s, (end - start) * 1e-9 / MOST_INTERVALS)
+    correction = Correction.none(start, end, knots_s)
     adjusted = Adjusted(correction, None, {})
     overlapping = len(before) >= FEWEST or control is not None
     if overlapping:
@@ -113,8 +115,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
         if control is not None:
             clusters = np.concatenate([clusters, as_clusters(control, site.route.origin_m, end)])
             control_sigma = np.concatenate([control_sigma, control[:, 3]])
-        capture = task.options.capture_m or 3.0 * float(np.hypot(sigmas.position_m, sigmas.attitude_rad * arm_m))
-        first_m = float(np.clip(2.0 * capture, voxel_m, COARSEST_M))
+        first_m = float(np.clip(2.0 * _capture_m(site, sigmas, arm_m), voxel_m, COARSEST_M))
         adjusted = adjust(
             clusters, control_sigma, correction, voxel_m, first_m, sigmas, task.options, site.route.has_attitude
         )
@@ -122,6 +123,16 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     with made_folder(task.folder):
         _write(task, site, strips, voxel_m, sigmas, share, adjusted, before, note, progress)
         return report.finished(task.folder)
+
+
+def _capture_m(site: Site, sigmas: Sigmas, arm_m: float) -> float:
+    """What strips may differ by to begin with: three sigmas of what is known before."""
+    options = site.options
+    boresight = (
+        np.deg2rad(options.boresight_sigma_deg) if options.boresight != HOLD and site.route.has_attitude else 0.0
+    )
+    angle = np.hypot(sigmas.attitude_rad, boresight)
+    return options.capture_m or 3.0 * float(np.hypot(sigmas.position_m, angle * arm_m))
 
 
 def _nothing(strips: Strips, before: Differences) -> str:
@@ -169,8 +180,6 @@ def _survey(site: Site, progress: Progress) -> tuple[Strips, float, Sigmas]:
         density.add(chunk.xyz_m[covered] - site.route.origin_m)
         progress("times", len(covered))
     if site.outside > total // 2:
-        from flightlog.clock import utc_text
-
         times = site.route.poses.time_ns
         raise CoverageError(
             f"{site.outside} of {total} points lie outside of the trajectory: it covers {utc_text(int(times[0]))} to "
@@ -268,6 +277,3 @@ def check(before: Differences, after: Differences) -> None:
             raise SwathError(
                 f"self-check: strips differ by {now:.4f} m {name} (median) after the adjustment, by {was:.4f} m before; nothing was written"
             )
-
-
-__all__ = ["CaptureError", "Site", "Task", "check", "run"]
