@@ -107,7 +107,7 @@ class Signal:
 
 
 def noise_density(samples: Samples, time_s: Array) -> Array:
-    """Power spectral density of the noise about some times, shape as these: what a cubic through six samples in a row leaves, taken as white.
+    """Power spectral density of the noise about some times, shape as these: what a cubic through six samples leaves, taken as white.
 
     Motion that the samples are too slow for counts as noise, for it is what integrating them will miss; it changes in flight, and so
     the mean is that of `NOISE_S` around.

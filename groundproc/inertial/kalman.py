@@ -327,6 +327,7 @@ def _back(
     residual: Any,
     kept: Any,
     kept_covariance: Any,
+    kept_variance: Any,
 ) -> None:
     """Smooth the nodes of one block from its last to the one after its first; of the first block all."""
     reference, imu, gravity, keep, _ = motion
@@ -340,7 +341,10 @@ def _back(
             residual[row] = _left(row, rows, state)
         if k % stride == 0:
             kept[k // stride] = state
-            kept_covariance[k // stride] = ps[k - low] - ps[k - low] @ (n @ ps[k - low])
+            full = ps[k - low] - ps[k - low] @ (n @ ps[k - low])
+            kept_covariance[k // stride] = full[:POSE, :POSE]
+            for i in range(STATES):
+                kept_variance[k // stride, i] = full[i, i]
         if k > low:
             for row in range(first[k + 1] - 1, first[k] - 1, -1):
                 _undo(row, rows, r, n, gains[row - base], innovations[row - base], spreads[row - base], work)
@@ -365,6 +369,7 @@ def smooth(
     residual: Any,
     kept: Any,
     kept_covariance: Any,
+    kept_variance: Any,
 ) -> float:
     """Filter forward, smooth back.
 
@@ -396,8 +401,10 @@ def smooth(
         Out: what is left of each measurement.
     kept : ndarray, shape (ceil(n / stride), STATES)
         Out: all smoothed states.
-    kept_covariance : ndarray, shape (ceil(n / stride), STATES, STATES)
-        Out: their covariance, single precision.
+    kept_covariance : ndarray, shape (ceil(n / stride), 9, 9)
+        Out: covariance of position, velocity and attitude, single precision.
+    kept_variance : ndarray, shape (ceil(n / stride), STATES)
+        Out: variance of all states.
 
     Returns
     -------
@@ -424,5 +431,20 @@ def smooth(
         low, high = block * BLOCK, min((block + 1) * BLOCK, nodes - 1)
         tape[0][0], tape[1][0] = saved_x[block], saved_p[block]
         _record(low, high, motion, first, rows, tape)
-        _back(low, high, motion, first, rows, tape, r, n, stride, correction, residual, kept, kept_covariance)
+        _back(
+            low,
+            high,
+            motion,
+            first,
+            rows,
+            tape,
+            r,
+            n,
+            stride,
+            correction,
+            residual,
+            kept,
+            kept_covariance,
+            kept_variance,
+        )
     return misfit

@@ -69,7 +69,10 @@ class Solution:
         UTC of what follows.
     states : ndarray, shape (k, STATES)
         Smoothed; position, velocity and attitude are what was left to correct in the last iteration.
-    covariance : ndarray of float32, shape (k, STATES, STATES)
+    covariance : ndarray of float32, shape (k, 9, 9)
+        Of position, velocity and attitude.
+    variance : ndarray, shape (k, STATES)
+        Of all states.
     residual_rms, rows, outliers : dict of str to float or int
         By the kind of the measurement.
     stands_s : float
@@ -92,6 +95,7 @@ class Solution:
     kept_ns: npt.NDArray[np.int64]
     states: Array
     covariance: npt.NDArray[np.float32]
+    variance: Array
     residual_rms: dict[str, float]
     rows: dict[str, int]
     outliers: dict[str, int]
@@ -131,7 +135,8 @@ def solve(readings: Readings, model: Model | None = None) -> Solution:
     stride = max(KEPT_NS // readings.step_ns, 1)
     nodes = len(readings.nodes_s)
     slots = -(-nodes // stride)
-    states, covariance = np.empty((slots, STATES)), np.empty((slots, STATES, STATES), np.float32)
+    states, covariance = np.empty((slots, STATES)), np.empty((slots, POSE, POSE), np.float32)
+    spread = np.empty((slots, STATES))
     weight: Array | None = None
     moved = (np.inf, np.inf)
     iteration = 0
@@ -153,6 +158,7 @@ def solve(readings: Readings, model: Model | None = None) -> Solution:
             residual,
             states,
             covariance,
+            spread,
         )
         reference = _corrected(reference, correction)
         moved = (
@@ -163,7 +169,7 @@ def solve(readings: Readings, model: Model | None = None) -> Solution:
             break
         if iteration < ITERATIONS:
             if iteration <= 3:
-                model = _learnt(model, system, residual, weight, states, covariance)
+                model = _learnt(model, system, residual, states, spread)
             weight = 1.0 / (1.0 + np.square(residual / _noise(system, model) / OUTLIER))
     return _solution(
         readings,
@@ -172,6 +178,7 @@ def solve(readings: Readings, model: Model | None = None) -> Solution:
         reference,
         states,
         covariance,
+        spread,
         system,
         residual,
         weight,
@@ -265,6 +272,7 @@ def _smooth(
     residual: Array,
     states: Array,
     covariance: npt.NDArray[np.float32],
+    spread: Array,
 ) -> Array:
     """One step: corrections of the reference's position, velocity and attitude, shape (n, 9)."""
     step_s = np.diff(r.nodes_s)
@@ -318,6 +326,7 @@ def _smooth(
         residual,
         states,
         covariance,
+        spread,
     )
     return correction
 
@@ -349,22 +358,13 @@ def _noise(system: System, model: Model) -> Array:
     return np.asarray(sigma)
 
 
-def _learnt(
-    model: Model,
-    system: System,
-    residual: Array,
-    weight: Array | None,
-    states: Array,
-    covariance: npt.NDArray[np.float32],
-) -> Model:
+def _learnt(model: Model, system: System, residual: Array, states: Array, variance: Array) -> Model:
     """White noise from the residuals' median, and the size of the correlated errors from the states themselves (expectation step)."""
-    del weight
     changed: dict[str, Any] = {}
     for kind, (name, least, most) in _LEARNT.items():
         chosen = residual[system.kind == KINDS.index(kind)]
         if len(chosen) >= 50:
             changed[name] = float(np.clip(1.4826 * np.median(np.abs(chosen)), least, most))
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
     for name, part, least, most in (
         ("tilt_rad", slice(TILT, TILT + 2), np.deg2rad(0.2), np.deg2rad(10.0)),
         ("heading_rad", slice(HEADING, HEADING + 1), np.deg2rad(0.3), np.deg2rad(20.0)),
@@ -381,6 +381,7 @@ def _solution(
     reference: Reference,
     states: Array,
     covariance: npt.NDArray[np.float32],
+    variance: Array,
     system: System,
     residual: Array,
     weight: Array | None,
@@ -414,6 +415,7 @@ def _solution(
         kept_ns,
         states,
         covariance,
+        variance,
         rms,
         count,
         outliers,

@@ -197,7 +197,7 @@ def report(solution: Solution) -> dict[str, Any]:
     """What quality.json says of one leg."""
     r, model = solution.readings, solution.model
     middle = len(solution.kept_ns) // 2
-    state, sigma = solution.states[middle], np.sqrt(np.diagonal(solution.covariance[middle])).astype(np.float64)
+    state, sigma = solution.states[middle], np.sqrt(solution.variance[middle])
 
     def stated(first: int, count: int, unit: float = 1.0) -> dict[str, list[float]]:
         part = slice(first, first + count)

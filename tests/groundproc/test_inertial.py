@@ -101,7 +101,7 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
     densities = np.full(NODES - 1, 1e-4), np.full(NODES - 1, 1e-2)
     start, covariance = 0.01 * rng.standard_normal(STATES), np.diag(rng.uniform(1e-3, 1e-1, STATES))
     correction, residual = np.empty((NODES, 9)), np.empty(len(rows[3]))
-    kept, kept_covariance = np.empty((NODES, STATES)), np.empty((NODES, STATES, STATES))
+    kept, variance, kept_covariance = np.empty((NODES, STATES)), np.empty((NODES, STATES)), np.empty((NODES, 9, 9))
     monkeypatch.setattr(kalman, "BLOCK", block)
     smooth = kalman.smooth if block == 400 else kalman.smooth.py_func
     if block != 400:
@@ -110,7 +110,7 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
     keep = np.tile(KEEP, (NODES - 1, 1))
     smooth(
         reference, (np.full(NODES - 1, STEP_S), angle, push, *densities), GRAVITY, keep, drive, first, rows, start, covariance, 1,
-        correction, residual, kept, kept_covariance,
+        correction, residual, kept, kept_covariance, variance,
     )  # fmt: skip
     # all states of all nodes as one Gaussian vector, conditioned on all measurements at once
     noise = drive * STEP_S
@@ -135,8 +135,11 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
     # derivatives of the filter are of first order in the angles of a step, 0.02 rad
     assert np.abs(kept - expected).max() < 0.02 * np.abs(expected).max()
     assert (np.abs(kept - expected) / sigma).max() < 0.05
-    stated = np.sqrt(np.diagonal(kept_covariance, axis1=1, axis2=2))
-    assert np.abs(stated / sigma - 1.0).max() < 0.02
+    assert np.abs(np.sqrt(variance) / sigma - 1.0).max() < 0.02
+    whole = joint - gain @ lines @ joint
+    poses = np.stack([whole[k * STATES : k * STATES + 9, k * STATES : k * STATES + 9] for k in range(NODES)])
+    each = sigma[:, :9, None] * sigma[:, None, :9]
+    assert np.abs((kept_covariance - poses) / each).max() < 0.03
     np.testing.assert_array_equal(correction, kept[:, :9])
 
 
