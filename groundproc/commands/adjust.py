@@ -79,10 +79,12 @@ def _text(told: dict[str, Any], folder: Path) -> str:
             )
     for name, found in told["mount"].items():
         values = ", ".join(
-            f"{value:+.4f} (sigma {sigma:.4f})"
-            for value, sigma in zip(found["right_forward_up"], found["sigma"], strict=True)
+            f"{side} {value:+.4f} (sigma {sigma:.4f})" if state == "estimated" else f"{side} held (sigma {sigma:.4f})"
+            for side, value, sigma, state in zip(
+                ("right", "forward", "up"), found["right_forward_up"], found["sigma"], found["state"], strict=True
+            )
         )
-        lines.append(f"{name} {found['state']}: {values}")
+        lines.append(f"{name}: {values}")
     if told["points"]["outside_trajectory"]:
         lines.append(
             f"{told['points']['outside_trajectory']:,} points lie outside of the trajectory and are as they were"

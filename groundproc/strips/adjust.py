@@ -25,7 +25,9 @@ MOST_STEPS: Final = 8
 SETTLED: Final = 0.02
 """Steps end where the last one changes less than this part of the prior sigmas."""
 _TOLD: Final = 0.5
-"""A constant is estimated where the strips leave less than this part of its prior sigma."""
+"""A component of a constant is estimated where the strips leave less than this part of its prior sigma."""
+_HELD: Final = 1e-4
+"""What is held may move by this part of its prior sigma: by nothing that counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +94,7 @@ class Adjusted:
     linear : Linear or None
         None where there was no plane to go by.
     constants : dict
-        For each: value, sigma, and whether it is estimated or held.
+        For each: value, sigma, and which components are estimated; the others are held, their sigma is what the strips would leave.
     log : list of dict
         Figures of each step.
     """
@@ -144,32 +146,37 @@ def adjust(
     choice = {"boresight_rad": options.boresight, "lever_m": options.lever}
     free = [name for name, how in choice.items() if how in (AUTO, FREE) and has_attitude]
     prior = {
-        "boresight_rad": np.deg2rad(options.boresight_sigma_deg), "lever_m": options.lever_sigma_m, "shift_m": sigmas.position_m,
-    }  # fmt: skip
-    work = _Work(clusters, control_sigma_m, sigmas, options, prior)
+        "boresight_rad": np.full(3, np.deg2rad(options.boresight_sigma_deg)),
+        "lever_m": np.full(3, options.lever_sigma_m),
+        "shift_m": np.full(3, sigmas.position_m),
+    }
+    work = _Work(clusters, control_sigma_m, sigmas, options, prior | {})
     edges = [start_m]
     while edges[-1] > 1.01 * voxel_m:
         edges.append(max(edges[-1] / 2.0, voxel_m))
     log: list[dict[str, float]] = []
-    linear: Linear | None = None
     for edge in edges:
-        correction, linear = work.step(correction, edge, False, free, log)
+        correction, _ = work.step(correction, edge, False, free, log)
     correction, linear = work.settle(correction, voxel_m, free, log)
     sigma = {} if linear is None else linear.constant_sigmas()
-    held = [n for n in free if choice[n] == AUTO and n in sigma and (sigma[n] > _TOLD * prior[n]).any()]
-    if held:
-        free = [name for name in free if name not in held]
-        zero = {name: -getattr(correction, name) for name in held}
-        correction = correction.changed(np.zeros_like(correction.coefficients), zero)
+    told = {name: np.full(3, name in free and linear is not None) for name in choice}
+    for name in free:
+        if choice[name] == AUTO and name in sigma:
+            told[name] = sigma[name] <= _TOLD * prior[name]
+            work.prior[name] = np.where(told[name], prior[name], _HELD * prior[name])
+    if not all(told[name].all() for name in free) and linear is not None:
+        back = {name: np.where(told[name], 0.0, -getattr(correction, name)) for name in free}
+        correction = correction.changed(np.zeros_like(correction.coefficients), back)
         correction, linear = work.settle(correction, voxel_m, free, log)
-        sigma |= {} if linear is None else linear.constant_sigmas()
-    constants = {}
-    for name in ("boresight_rad", "lever_m"):
-        state = "estimated" if name in free and linear is not None else "held"
-        constants[name] = {
-            "state": state, "value": getattr(correction, name), "sigma": sigma.get(name, np.full(3, prior[name])),
-            "prior_sigma": prior[name],
-        }  # fmt: skip
+        again = {} if linear is None else linear.constant_sigmas()
+        sigma = {name: np.where(told.get(name, True), again.get(name, value), value) for name, value in sigma.items()}
+    constants = {
+        name: {
+            "estimated": told[name], "value": np.where(told[name], getattr(correction, name), 0.0),
+            "sigma": sigma.get(name, prior[name]), "prior_sigma": prior[name],
+        }
+        for name in choice
+    }  # fmt: skip
     return Adjusted(correction, linear, constants, log)
 
 
@@ -181,7 +188,7 @@ class _Work:
     control_sigma_m: Array
     sigmas: Sigmas
     options: StripOptions
-    prior: dict[str, float]
+    prior: dict[str, Array]
 
     def settle(
         self, correction: Correction, voxel_m: float, free: list[str], log: list[dict[str, float]]
@@ -210,7 +217,7 @@ class _Work:
             return correction, None
         unknowns = Unknowns(correction.intervals)
         for name in constants:
-            unknowns.add(name, np.full(3, self.prior[name]))
+            unknowns.add(name, self.prior[name])
         factors = [
             wandering(correction, unknowns, self.sigmas, self.options),
             constant_prior(correction, unknowns),

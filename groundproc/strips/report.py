@@ -168,9 +168,11 @@ def _mount(adjusted: Adjusted) -> dict[str, Any]:
         if found is None:
             continue
         told[key] = {
-            "state": found["state"], "right_forward_up": _list(unit * found["value"]), "sigma": _list(unit * found["sigma"]),
-            "prior_sigma": round(float(unit * found["prior_sigma"]), 6),
-        }  # fmt: skip
+            "state": ["estimated" if known else "held" for known in found["estimated"]],
+            "right_forward_up": _list(unit * found["value"]),
+            "sigma": _list(unit * found["sigma"]),
+            "prior_sigma": round(float(unit * found["prior_sigma"][0]), 6),
+        }
     return told
 
 

@@ -30,7 +30,9 @@ def test_strips_that_lay_decimetres_apart_lie_on_each_other(adjusted: Any) -> No
 
 def test_boresight_and_lever_arm_are_found_within_three_sigma(adjusted: Any) -> None:
     boresight, lever = adjusted.told["mount"]["boresight_deg"], adjusted.told["mount"]["lever_m"]
-    assert boresight["state"] == "estimated"
+    assert boresight["state"] == ["estimated"] * 3
+    # over strips at one height nothing tells how high the scanner sits
+    assert lever["state"] == ["estimated", "estimated", "held"]
     error = np.array(boresight["right_forward_up"]) - [0.2, -0.15, 0.25]
     assert (np.abs(error) < 3 * np.array(boresight["sigma"])).all()
     assert (np.array(boresight["sigma"]) < 0.03).all()
@@ -119,7 +121,7 @@ def test_over_open_water_the_points_are_as_they_were(tmp_path: Path, adjust: Cal
 
 
 def test_what_strips_cannot_tell_is_held(tmp_path: Path, adjust: Callable[..., Any]) -> None:
-    """Three passes along one line in one direction: the lever arm shifts all of them alike."""
+    """Three passes along one line in one direction: the lever arm shifts all of them alike, whatever it is."""
     there = [(-60, 0), (60, 0)]
     passes = [aerial.flown(there) for _ in range(3)]
     seconds = passes[0].time_s[-1]
@@ -135,9 +137,9 @@ def test_what_strips_cannot_tell_is_held(tmp_path: Path, adjust: Callable[..., A
     outcome = adjust(tmp_path, scan)
     assert outcome.code == 0
     lever = outcome.told["mount"]["lever_m"]
-    assert lever["state"] == "held"
+    assert lever["state"] == ["held"] * 3
     assert lever["right_forward_up"] == [0, 0, 0]
-    assert max(lever["sigma"]) > 0.02
+    assert min(lever["sigma"]) > 0.02
     assert outcome.told["strips"]["count"] == 3
 
 
@@ -223,7 +225,7 @@ def test_positions_alone_do_for_the_splines(tmp_path: Path, adjust: Callable[...
     words = [str(tmp_path / "cloud.laz"), "-t", str(tmp_path / "f.pos"), "-o", str(tmp_path / "out")]
     assert main(["adjust", *words]) == 0
     told = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    assert told["mount"]["boresight_deg"]["state"] == "held"
+    assert told["mount"]["boresight_deg"]["state"] == ["held"] * 3
     before, after = (told["differences"][name]["normal"]["sigma_mad_m"] for name in ("before", "after"))
     assert after < 0.25 * before
 
