@@ -36,7 +36,7 @@ class DynamicOptions:
         "source: to the letter, a revolution against the one before; robust: with what is marked (robust) below",
         choices=(ROBUST, SOURCE),
     )
-    start: str = option("ins", "method of the trajectory that is trimmed", choices=("ins",))
+    start: str = option("ins", "method of the trajectory that is trimmed", choices=("ins", "filtered"))
     steps: StepOptions = option(StepOptions, "changes tried in a revolution")
     cut_m: float = option(
         0.7,
