@@ -221,7 +221,9 @@ class Estimator:
         tracks = [track for track in boot.gyros() if 0.0 < track.rate_hz < 1e3]
         if not tracks:
             return
-        best = max(tracks, key=lambda track: track.rate_hz)
+        # a series with forces before a slightly faster one without
+        felt = {name for name, _ in INS_FORCES}
+        best = max(tracks, key=lambda track: track.rate_hz * (2.0 if track.name in felt else 1.0))
         force = np.full_like(best.rate_rad_s, np.nan)
         for name, unit in INS_FORCES:
             if best.name == name:

@@ -1,0 +1,233 @@
+"""`swath live` against the simulation's truth: in real time from the network, and behind a log that grows."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from flightlog import records
+from flightlog.logfile import LogReader, LogWriter
+from groundproc.accuracy.alignment import best_rigid
+from groundproc.cli import main
+from groundproc.trajectory.table import read_trajectory
+
+Array = npt.NDArray[np.float64]
+
+SWATH = [sys.executable, "-c", "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"]
+FLIGHT_S = 18.0
+START_S = 5.0
+"""What the start may take: 3 s of clocks and gyros, and the searches for them."""
+POSITION_RMS_M = 0.05
+"""A tenth of a second old and without a look back: an odometry of 2 cm ranges on planes, begun from a moving autopilot's attitude."""
+
+
+@pytest.fixture(scope="module")
+def flight(simulated: Callable[..., Any]) -> Any:
+    from simulator.config import Options
+
+    return simulated("live_flight", "village", FLIGHT_S, Options())
+
+
+def free_port(kind: int = socket.SOCK_DGRAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def rows(folder: Path) -> npt.NDArray[np.void]:
+    return np.asarray(np.genfromtxt(folder / "trajectory_live.csv", delimiter=",", names=True, dtype=None))
+
+
+def utc_of(flight: Any, lidar_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """True UTC of lidar times, which swath carries on over the hour: whole hours between the two mean nothing."""
+    clock, utc = flight.truth["clocks"]["lidar"], flight.truth["clocks"]["utc"]
+    hour = 3600 * 10**9
+    since = lidar_ns - clock["start_ns"]
+    since -= np.round((since - FLIGHT_S * 5e8) / hour).astype(np.int64)[0] * hour
+    return np.asarray(utc["start_ns"] + np.rint(since / (1 + clock["drift_ppm"] * 1e-6)).astype(np.int64))
+
+
+def errors_m(flight: Any, table: npt.NDArray[np.void]) -> Array:
+    """Distances from the truth after one rigid alignment."""
+    truth = read_trajectory(flight.poses_file)
+    poses, covered = truth.where_covered(utc_of(flight, table["lidar_ns"].astype(np.int64)))
+    estimated = np.stack([table[name] for name in ("east_m", "north_m", "up_m")], axis=1)[covered]
+    true = poses.position_m[covered]
+    assert covered.sum() >= 0.95 * len(table)
+    rigid = best_rigid(estimated, true)
+    return np.asarray(np.linalg.norm(rigid.points(estimated) - true, axis=1))
+
+
+class Live:
+    """A running `swath live` that listens."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.lidar, self.position, self.mavlink = free_port(), free_port(), free_port()
+        self.page = free_port(socket.SOCK_STREAM)
+        words = ["--address", "127.0.0.1", "--lidar-port", str(self.lidar), "--position-port", str(self.position)]
+        words += ["--mavlink", f"udp:127.0.0.1:{self.mavlink}", "--port", str(self.page), "--json", "-o", str(folder)]
+        self.process = subprocess.Popen(
+            [*SWATH, "live", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            if line.startswith("listening"):
+                return
+        pytest.fail(f"it ended with {self.process.wait()}")
+
+    def get(self, path: str) -> tuple[http.client.HTTPMessage, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.page, timeout=20)
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        body = answer.read()
+        connection.close()
+        return answer.headers, body
+
+    def end(self) -> tuple[list[dict[str, Any]], float]:
+        """SIGTERM; what it told, and the CPU time that it took [s]."""
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        told = [json.loads(line) for line in self.process.stdout]
+        self.process.stdout.close()
+        self.process.stderr.close()
+        _, code, usage = os.wait4(self.process.pid, 0)
+        self.process.returncode = os.waitstatus_to_exitcode(code)
+        assert self.process.returncode == 0
+        return told, usage.ru_utime + usage.ru_stime
+
+
+def test_a_flight_is_followed_in_real_time(tmp_path: Path, flight: Any) -> None:
+    live = Live(tmp_path / "live")
+    try:
+        words = ["--lidar-port", str(live.lidar), "--position-port", str(live.position)]
+        words += ["--mavlink", f"udp:127.0.0.1:{live.mavlink}"]
+        begun_s = time.monotonic()
+        played = subprocess.run([*SWATH, "replay", str(flight.log), *words], check=True, capture_output=True, text=True)
+        took_s = time.monotonic() - begun_s
+        time.sleep(1.5)
+        status = json.loads(live.get("/status")[1])
+        head, body = live.get("/points?generation=0&from=0")
+        told, cpu_s = live.end()
+    finally:
+        if live.process.returncode is None:
+            live.process.kill()
+            live.process.wait()
+    table = rows(live.folder)
+    assert len(table) >= 10 * (FLIGHT_S - START_S)
+    assert (np.diff(table["lidar_ns"]) == 100_000_000).all()
+    assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < POSITION_RMS_M
+    # 1.5 times real time on one core even if everything, start and the cloud's file too, is put to the flight's account
+    assert cpu_s < FLIGHT_S / 1.5
+    late_s = max(map(float, re.findall(r"at worst (\d+) ms late", played.stdout))) * 1e-3
+    if os.getloadavg()[0] < 1.5 and late_s < 0.1 and took_s < FLIGHT_S + 3.0:
+        # where others do not take the cores away
+        assert np.percentile(table["lag_s"][20:], 95) < 0.5
+    assert status["drops"]["queue"] == status["drops"]["kernel"] == status["drops"]["rejected"] == 0
+    assert status["cloud"]["points"] >= int(head["X-Count"]) > 50_000
+    assert len(body) == 13 * int(head["X-Count"])
+    assert {one["state"] for one in told} >= {"tracking"}
+    cloud = laspy.read(live.folder / "cloud_live.laz")
+    assert len(cloud.points) == status["cloud"]["points"]
+
+
+def test_it_agrees_with_the_causal_method_on_the_log(tmp_path: Path, flight: Any) -> None:
+    """Behind the finished log, and by `swath process --method adjusted --causal`: the same filter in other slices."""
+    out, processed = tmp_path / "live", tmp_path / "processed"
+    assert main(["live", "--follow", str(flight.log), "--port", "0", "-o", str(out)]) == 0
+    assert main(["process", str(flight.log), "--method", "adjusted", "--causal", "-o", str(processed)]) == 0
+    table, causal = rows(out), read_trajectory(processed / "trajectory.csv")
+    poses, covered = causal.where_covered(table["utc_ns"].astype(np.int64))
+    estimated = np.stack([table[name] for name in ("east_m", "north_m", "up_m")], axis=1)[covered]
+    # UTC labels of the live rows may be late by the link's delay: along the path that is no difference between methods
+    velocity = np.gradient(poses.position_m[covered], 0.1, axis=0)
+    rigid = best_rigid(estimated, poses.position_m[covered])
+    off = rigid.points(estimated) - poses.position_m[covered]
+    late_s = (off * velocity).sum() / np.square(velocity).sum()
+    assert abs(late_s) < 0.1
+    off = off - late_s * velocity
+    assert len(off) > 10 * (FLIGHT_S - START_S)
+    assert np.sqrt(np.square(off).sum(axis=1).mean()) < POSITION_RMS_M
+    assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < POSITION_RMS_M
+
+
+def test_a_log_that_grows_is_followed_to_its_end(tmp_path: Path, flight: Any) -> None:
+    grown, out = tmp_path / "grown.mcap", tmp_path / "live"
+    content = flight.log.read_bytes()
+    grown.write_bytes(content[:100_000])
+
+    def grow() -> None:
+        with grown.open("ab") as file:
+            for start in range(100_000, len(content), 3_000_017):
+                file.write(content[start : start + 3_000_017])
+                file.flush()
+                time.sleep(0.1)
+
+    writer = threading.Thread(target=grow)
+    writer.start()
+    try:
+        code = main(["live", "--follow", str(grown), "--port", "0", "-o", str(out)])
+    finally:
+        writer.join()
+    assert code == 0
+    table = rows(out)
+    assert len(table) >= 10 * (FLIGHT_S - START_S)
+    assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < POSITION_RMS_M
+
+
+def test_without_the_lidars_own_unit_the_autopilots_carries_it(tmp_path: Path, flight: Any) -> None:
+    """No position packets, as where port 8308 is not sent down: RAW_IMU at 25 Hz, on clocks tied by receive times."""
+    bare = tmp_path / "bare.mcap"
+    with LogReader(flight.log) as reader, bare.open("wb") as file:
+        writer = LogWriter(file, metadata=dict(reader.metadata), attachments=dict(reader.attachments))
+        for message in reader.messages():
+            if message.topic != records.POSITION.topic:
+                writer.write(message.topic, message.log_time_ns, bytes(message.data))
+        writer.finish()
+    assert main(["live", "--follow", str(bare), "--port", "0", "-o", str(tmp_path / "live")]) == 0
+    table = rows(tmp_path / "live")
+    assert len(table) >= 10 * (FLIGHT_S - START_S - 1.0)
+    assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < 3 * POSITION_RMS_M
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "sentence"),
+    [
+        (["--follow", "none.mcap"], 1, "none.mcap: cannot be opened"),
+        (["--mavlink", "udp:nothing"], 2, "--mavlink 'udp:nothing': expected udp:ADDRESS:PORT"),
+        (["--points", "5"], 2, "--points 5: expected 10000 or more"),
+        (["--address", "203.0.113.7"], 1, "UDP port 2368 at 203.0.113.7 cannot be opened"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, sentence: str
+) -> None:
+    out = tmp_path / "out"
+    assert main(["live", "-o", str(out), "--port", "0", *words]) == code
+    errors = capsys.readouterr().err.strip()
+    assert errors.count("\n") == 0
+    assert sentence in errors
+    assert not out.exists()
+
+
+def test_nothing_heard_leaves_no_cloud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--address", "127.0.0.1", "--lidar-port", str(free_port()), "--position-port", str(free_port())]
+    words += ["--mavlink", f"udp:127.0.0.1:{free_port()}", "--port", "0", "--duration", "1.2"]
+    assert main(["live", "-o", str(tmp_path / "out"), *words]) == 0
+    assert "no pose" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["trajectory_live.csv"]
