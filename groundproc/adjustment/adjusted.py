@@ -9,18 +9,18 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.adjustment.anchors import Attitudes, Positions
-from groundproc.adjustment.batch import DRAWS, Batch, Posterior, make_unit, turned
-from groundproc.adjustment.factors import H, Unit
+from groundproc.adjustment.batch import COMPASS_PRIOR, PRIORS, turned
+from groundproc.adjustment.factors import H
 from groundproc.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
 from groundproc.adjustment.scans import STEP_NS, STEPS, slices
 from groundproc.adjustment.spline import Path
-from groundproc.adjustment.track import Track, Tracker, follow, grid_ns
+from groundproc.adjustment.track import Track, Tracker, grid_ns, tracked
+from groundproc.adjustment.windows import OVERLAP, WINDOW, Sources, Window, adjust_window, joined_path
 from groundproc.geodesy import LocalFrame
 from groundproc.timeline import Leg
 from groundproc.trajectory import ins
@@ -29,9 +29,10 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
 
-POSITION_TAU_S: Final = 60.0
+POSITION_TAU_S: Final = np.array([60.0, 60.0, 300.0])
 POSITION_WHITE_M: Final = 0.1
-"""Errors of a GNSS receiver that smooths: they last for a minute, and a tenth of a metre is new each second."""
+"""Errors of a GNSS receiver that smooths last for a minute, those of a height that the barometer carries for longer (east, north, up);
+a tenth of a metre is new each second."""
 LEAST_POSITION_SIGMA_M: Final = 0.02
 ATTITUDE_SIGMA_RAD: Final = np.deg2rad([1.0, 1.0, 2.0])
 ATTITUDE_TAU_S: Final = 10.0
@@ -68,7 +69,7 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     mount = main.mount(given.mount)
     warnings = [w for run in made for w in run.warnings()] + [str(reason) for reason in reasons]
     return Estimate(
-        joined([run.trajectory(given, mount) for run in made]),
+        joined([run.trajectory(given, mount) if not run.is_blind() else own_part(start, run) for run in made]),
         mount,
         main.SIGMA_SOURCE,
         report=main.report(given.mount),
@@ -78,14 +79,12 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
 
 @dataclass(slots=True)
 class Run:
-    """The adjustment of one run of the lidar's clock.
+    """The adjustment of one run of the lidar's clock: its windows, and the path joined of them.
 
     Attributes
     ----------
+    windows : list of Window
     path : Path
-    batch : Batch
-    draws : ndarray, shape (DRAWS, unknowns)
-    posterior : Posterior
     track : Track
     motion : Motion
     """
@@ -95,77 +94,55 @@ class Run:
         "errors; absolute position and heading are the GNSS's and the compass's"
     )
 
+    windows: list[Window]
     path: Path
-    batch: Batch
-    draws: Array
-    posterior: Posterior
     track: Track
     motion: Motion
 
-    def ins_unit(self) -> Unit | None:
-        """The autopilot's unit."""
-        return next((unit for unit in self.batch.units if unit.name == "ins"), None)
+    def estimates(self) -> dict[str, tuple[Array, Array]]:
+        """Globals over all windows: mean by their variances, and its sigma."""
+        found = {}
+        for name in self.windows[0].values:
+            values = np.array([window.values[name][0] for window in self.windows])
+            weights = np.array([window.values[name][1] for window in self.windows]) ** -2.0
+            found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), weights.sum(axis=0) ** -0.5)
+        return found
 
     def mount(self, nominal: Mount) -> Mount:
         """The mount as estimated."""
-        unit = self.ins_unit()
-        if unit is None:
+        values = self.estimates()
+        if "ins.turn" not in values:
             return nominal
-        mat = nominal.mat_ins_lidar() @ turned(-unit.values["turn"])
+        mat = nominal.mat_ins_lidar() @ turned(-values["ins.turn"][0])
         heading, pitch, roll = (float(np.rad2deg(a[0])) for a in frames.attitude_of(mat[None]))
-        lever = -mat @ unit.values["lever"]
+        lever = nominal.lidar_position_m()
+        if "ins.lever" in values:
+            lever = -mat @ values["ins.lever"][0]
         x, y, z = (float(v) for v in lever)
-        return nominal.with_lidar(yaw_deg=-heading, pitch_deg=pitch, roll_deg=roll, position_m=(x, y, z))
+        return nominal.with_lidar(
+            yaw_deg=(180.0 - heading) % 360.0 - 180.0, pitch_deg=pitch, roll_deg=roll, position_m=(x, y, z)
+        )
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""
-        sigmas = self._sigmas(mount.mat_ins_lidar(), mount.lidar_position_m())
+        position = np.concatenate([w.sigma_position_m[: w.own + (w is self.windows[-1])] for w in self.windows])
+        attitude = np.concatenate([w.sigma_attitude_rad[: w.own + (w is self.windows[-1])] for w in self.windows])
+        grid, knots = np.arange(len(self.path.quat)), np.arange(len(position)) * STEPS
+        sigmas = (np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (position, attitude))
         return of_ins(self.path, self.motion, given.frame, mount, *sigmas)
-
-    def _sigmas(self, mat_ins_lidar: Array, lever: Array) -> tuple[Array, Array]:
-        """Sigmas of position and of roll, pitch, heading on the grid."""
-        path, unknowns = self.path, self.posterior.unknowns
-        quat, place = path.quat[::STEPS], path.position_m[::STEPS]
-        mats = frames.mat_from_quat(quat)
-        to_ins = -mat_ins_lidar.T @ lever
-        squares_position, squares_attitude = np.zeros((len(quat), 3)), np.zeros((len(quat), 3))
-        heading = frames.attitude_of(mats @ mat_ins_lidar.T)[0]
-        right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
-        ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
-        for draw in self.draws:
-            part = {name: draw[where] for name, where in unknowns.names.items()}
-            spline = draw[: unknowns.path_size].reshape(-1, 6)
-            at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
-            in_body = at[:, :3] + part.get("ins.turn", np.zeros(3))
-            turn = np.einsum("nij,nj->ni", mats, in_body) + part["world.turn"]
-            arm = np.cross(at[:, :3], to_ins) + part.get("ins.lever", np.zeros(3))
-            moved = at[:, 3:] + np.cross(part["world.turn"], place) + part["world.shift"]
-            squares_position += np.square(moved + np.einsum("nij,nj->ni", mats, arm))
-            squares_attitude += np.square(
-                np.stack([(turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1), turn[:, 2]], axis=1)
-            )
-        # what the gyro adds between two knots, the mean of a Brownian bridge
-        bridge = self.motion.rate_density**2 * H / 6.0
-        smooth = [
-            uniform_filter1d(s / len(self.draws), 11, axis=0, mode="nearest")
-            for s in (squares_position, squares_attitude)
-        ]
-        grid, knots = np.arange(len(path.quat)), np.arange(len(quat)) * STEPS
-        position, attitude = (
-            np.stack([np.interp(grid, knots, axis) for axis in variance.T], axis=1) for variance in smooth
-        )
-        return np.sqrt(position), np.sqrt(attitude + bridge)
 
     def warnings(self) -> list[str]:
         """What the self-check found, a sentence each."""
-        found, last = lost(self.track), self.batch.log[-1]
-        if last["chi_square"] > 3.0:
+        found = lost(self.track)
+        chi_square = max(window.log[-1]["chi_square"] for window in self.windows)
+        if chi_square > 3.0:
             found.append(
-                f"the lidar's residuals are {last['chi_square']:.1f} times what their noise explains, expected 1; the cloud may be doubled"
+                f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1; the cloud may be doubled"
             )
-        if last.get("position_rms", 0.0) > 4.0:
+        off = max(window.log[-1].get("position_rms", 0.0) for window in self.windows)
+        if off > 4.0:
             found.append(
-                f"the path differs from the GNSS positions by {last['position_rms']:.1f} sigma, expected 1; one of them is wrong"
+                f"the path differs from the GNSS positions by {off:.1f} sigma, expected 1; one of them is wrong"
             )
         return found
 
@@ -173,8 +150,14 @@ class Run:
         """Seconds in which the lidar saw next to no planes, the first one left out: there is no map yet."""
         return float(sum(m < 50 for m in self.track.matched[10:]) * H)
 
+    def is_blind(self) -> bool:
+        """Whether the lidar saw nothing for most of the flight: then the adjustment knows no more than what it began from."""
+        return self.blind_s() > 0.5 * len(self.track) * H
+
     def note(self) -> str:
         """What a reader must know though nothing is wrong."""
+        if self.is_blind():
+            return "the lidar saw next to no planes for most of the flight: the trajectory is what the adjustment began from"
         blind, whole = self.blind_s(), len(self.track) * H
         if blind <= 0.02 * whole:
             return ""
@@ -185,31 +168,26 @@ class Run:
 
     def report(self, nominal: Mount) -> dict[str, Any]:
         """What stands in quality.json."""
-        names = self.posterior.unknowns.names
-        sigma = {name: np.sqrt(np.mean(np.square(self.draws[:, where]), axis=0)) for name, where in names.items()}
         values: dict[str, Any] = {}
-        for unit in self.batch.units:
-            for name, value in unit.values.items():
-                key = f"{unit.name}.{name}"
-                if key in names:
-                    scale = np.rad2deg(1.0) if name in ("bias", "turn") else 1.0
-                    values[key + _UNITS[name]] = {
-                        "value": (value * scale).tolist(),
-                        "sigma": (sigma[key] * scale).tolist(),
-                        "prior": (self.posterior.unknowns.sigma[key] * scale).tolist(),
-                    }
-        values["compass_deg"] = {
-            "terms": ["constant", "sin h", "cos h", "sin 2h", "cos 2h"],
-            "value": np.rad2deg(self.batch.compass).tolist(),
-            "sigma": np.rad2deg(sigma["compass"]).tolist(),
-        }
+        for key, (value, sigma) in self.estimates().items():
+            name = key.rsplit(".", 1)[-1]
+            scale = np.rad2deg(1.0) if name in ("bias", "turn", "compass") else 1.0
+            prior = COMPASS_PRIOR if name == "compass" else np.full(len(value), PRIORS[key])
+            values[key + _UNITS[name]] = {
+                "value": (value * scale).tolist(),
+                "sigma": (sigma * scale).tolist(),
+                "prior_sigma": (prior * scale).tolist(),
+                "held": (sigma > 0.7 * prior).tolist(),
+            }
         mount = self.mount(nominal)
         return {
             "note": self.note(),
             "seconds": len(self.track) * H,
             "blind_s": self.blind_s(),
             "restarts": self.track.restarts,
-            "rounds": self.batch.log,
+            "windows": [
+                {"start_s": w.first * H, "seconds": (w.last - w.first) * H, "rounds": w.log} for w in self.windows
+            ],
             "estimated": values,
             "mount_change": {
                 "yaw_pitch_roll_deg": [
@@ -247,7 +225,7 @@ def of_ins(
 
 
 _UNITS: Final = {
-    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2", "lever": "_m",
+    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2", "lever": "_m", "compass": "_deg",
 }  # fmt: skip
 
 
@@ -278,6 +256,10 @@ class CausalRun:
         attitude = np.hypot(attitude, ATTITUDE_SIGMA_RAD * np.array([1.0, 1.0, 2.5]))
         return of_ins(self.path, self.motion, given.frame, mount, np.hypot(position, self.start_sigma_m), attitude)
 
+    def is_blind(self) -> bool:
+        """It is what it is."""
+        return False
+
     def warnings(self) -> list[str]:
         """What the self-check found."""
         return lost(self.track)
@@ -294,6 +276,12 @@ class CausalRun:
         }
 
 
+def own_part(start: Trajectory, run: Run | CausalRun) -> Trajectory:
+    """The part of what was begun from that lies within a run."""
+    first = run.path.start_ns
+    return start.after(first - 1).before(int(grid_ns(run.path)[-1]))
+
+
 def lost(track: Track) -> list[str]:
     """One sentence where the odometry lost its way."""
     if not track.restarts:
@@ -308,44 +296,49 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
     motion, own, other = base_motion(given, legs[0], given.flight.runs[number])
     positions = position_track(given, legs[0])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), positions, keep=False)
-    track = follow(slices(given, motion.start_ns, progress), tracker)
+    tracker = Tracker(
+        motion,
+        start,
+        mat,
+        lever,
+        gyro_offset(motion, own, other),
+        positions,
+        keep=False,
+        attitudes=attitude_track(legs[0]),
+    )
+    for piece in slices(given, motion.start_ns, progress):
+        tracker.feed(piece)
+    track = tracked(tracker)
     return CausalRun(track.causal_path(motion), track, motion, positions.sigma_m[0])
 
 
 def adjust_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory, progress: Progress) -> Run:
-    """Adjust one run of the lidar's clock."""
-    run = given.flight.runs[number]
-    leg = max(legs, key=lambda leg: leg.sync.samples)
+    """Adjust one run of the lidar's clock, window by window as the odometry goes on: the memory is that of a window."""
+    motion, own, other = base_motion(given, max(legs, key=lambda leg: leg.sync.samples), given.flight.runs[number])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    motion, own, other = base_motion(given, leg, run)
-    positions = [position_track(given, leg) for leg in legs]
-    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), positions[0])
-    track = follow(slices(given, motion.start_ns, progress), tracker)
-    batch = make_batch(given, legs, track, motion, own, other, 0, len(track))
-    posterior = batch.run()
-    return Run(batch.path, batch, posterior.draws(DRAWS), posterior, track, motion)
-
-
-def make_batch(
-    given: Given, legs: Sequence[Leg], track: Track, motion: Motion, own: ImuTrack | None, other: ImuTrack | None, first: int, last: int
-) -> Batch:  # fmt: skip
-    """The batch over slices `first` to `last` of a track."""
-    mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    path = track.path(motion, first, last)
-    bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
-    to_ins = -mat.T @ lever
-    units, tracks = [], {}
-    for name, unit in (("lidar", own), ("ins", other)):
-        if unit is not None:
-            offset = bias if unit is own or own is None else np.zeros(3)
-            units.append(make_unit(name, unit, path, offset, np.zeros(3) if name == "lidar" else to_ins))
-            tracks[name] = unit
-    attitudes = [attitude_track(leg) for leg in legs]
-    return Batch(
-        path, track.gathered(first, last), units, tracks, [position_track(given, leg) for leg in legs],
-        [a for a in attitudes if a is not None], mat.T, to_ins,
+    sources = Sources(
+        {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None},
+        [position_track(given, leg) for leg in legs],
+        [attitude for leg in legs if (attitude := attitude_track(leg)) is not None],
+        mat,
+        lever,
+    )
+    tracker = Tracker(
+        motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
+        attitudes=sources.attitudes[0] if sources.attitudes else None,
     )  # fmt: skip
+    windows: list[Window] = []
+    begin = 0
+    for piece in slices(given, motion.start_ns, progress):
+        tracker.feed(piece)
+        if tracker.track is not None and len(tracker.track) - begin >= WINDOW:
+            windows.append(adjust_window(tracker.track, motion, sources, begin, len(tracker.track), windows))
+            begin = len(tracker.track) - OVERLAP
+            tracker.track.forget(begin)
+    track = tracked(tracker)
+    if not windows or len(track) - begin > OVERLAP:
+        windows.append(adjust_window(track, motion, sources, begin, len(track), windows))
+    return Run(windows, joined_path(windows), track, motion)
 
 
 def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) -> Array:

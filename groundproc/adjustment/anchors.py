@@ -30,15 +30,17 @@ class Positions:
     position_m, sigma_m : ndarray, shape (n, 3)
     lever_m : ndarray, shape (3,)
         From the sensor to the point that they are of, sensor frame.
-    tau_s, white_m : float
-        How long their errors last; the part that is new in each second.
+    tau_s : ndarray, shape (3,)
+        How long their errors last.
+    white_m : float
+        The part of them that is new in each second.
     """
 
     time_ns: Ints
     position_m: Array
     sigma_m: Array
     lever_m: Array
-    tau_s: float
+    tau_s: Array
     white_m: float
 
 
@@ -61,6 +63,40 @@ class Attitudes:
     quat: Array
     sigma_rad: Array
     tau_s: float
+
+
+@dataclass(slots=True)
+class Tie:
+    """Poses of the sensor at the first knots of a path, as the window before left them.
+
+    Attributes
+    ----------
+    quat : ndarray, shape (n, 4)
+    position_m : ndarray, shape (n, 3)
+    """
+
+    quat: Array
+    position_m: Array
+
+
+TIE_SIGMA_RAD: Final = np.deg2rad(0.03)
+TIE_SIGMA_M: Final = 0.01
+"""How far two windows may differ at a knot of their overlap."""
+
+
+def tie_factor(given: Tie, path: Path, unknowns: Unknowns) -> Factor:
+    """The path against the poses of a tie."""
+    count = len(given.quat)
+    quat, position = path.quat[: count * STEPS : STEPS], path.position_m[: count * STEPS : STEPS]
+    residual = np.concatenate(
+        [frames.quat_log(frames.quat_multiply(frames.quat_inverse(given.quat), quat)), position - given.position_m],
+        axis=1,
+    )
+    builder, knot = RowBuilder(6 * count, unknowns), np.arange(count)
+    builder.at_knots(6 * knot, knot, 0, eye(count))
+    builder.at_knots(6 * knot + 3, knot, 3, eye(count))
+    sigma = np.tile(np.repeat([TIE_SIGMA_RAD, TIE_SIGMA_M], 3), count)
+    return Factor("tie", residual.ravel(), builder.matrix(), sigma)
 
 
 def spots(time_ns: Ints, path: Path) -> tuple[Ints, Array, Ints, Array]:
@@ -115,7 +151,15 @@ def position_factor(given: Positions, path: Path, unknowns: Unknowns) -> Factor 
     builder.at_times(row, knot, weights, 3, eye(count))
     builder.by(row, "world.turn", -cross(position[middle]))
     builder.by(row, "world.shift", eye(count))
-    return whitened("position", residual, builder.matrix(), time_ns[middle] * 1e-9, sigma, given.tau_s, given.white_m)
+    return whitened(
+        "position",
+        residual,
+        builder.matrix(),
+        time_ns[middle].astype(np.float64) * 1e-9,
+        sigma,
+        given.tau_s,
+        given.white_m,
+    )
 
 
 def attitude_factor(
@@ -162,8 +206,8 @@ def attitude_factor(
         "attitude",
         _means(off, group),
         builder.matrix(),
-        time_ns[middle] * 1e-9,
+        time_ns[middle].astype(np.float64) * 1e-9,
         sigma,
-        given.tau_s,
+        np.full(3, given.tau_s),
         float(0.1 * given.sigma_rad[0]),
     )

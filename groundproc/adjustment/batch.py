@@ -8,10 +8,18 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.adjustment.anchors import COMPASS_TERMS, Attitudes, Positions, attitude_factor, position_factor
+from groundproc.adjustment.anchors import (
+    COMPASS_TERMS,
+    Attitudes,
+    Positions,
+    Tie,
+    attitude_factor,
+    position_factor,
+    tie_factor,
+)
 from groundproc.adjustment.factors import (
-    H,
     Factor,
+    H,
     Unit,
     Unknowns,
     force_factor,
@@ -66,6 +74,8 @@ class Batch:
     compass : ndarray, shape (5,)
     most : int
         Rows of a slice.
+    tie : Tie, optional
+        To the window before.
     """
 
     path: Path
@@ -78,6 +88,7 @@ class Batch:
     lever_ins_m: Array
     compass: Array = field(default_factory=lambda: np.zeros(COMPASS_TERMS))
     most: int = 1000
+    tie: Tie | None = None
     log: list[dict[str, float]] = field(default_factory=list)
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
@@ -91,8 +102,9 @@ class Batch:
     def unknowns(self) -> Unknowns:
         """The unknowns that this flight's instruments have."""
         unknowns = Unknowns(self.path.intervals)
-        unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]))
-        unknowns.add("world.shift", np.full(3, 100.0))
+        free = 1.0 if self.tie is None else 1e-6
+        unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]) * free)
+        unknowns.add("world.shift", np.full(3, 100.0) * free)
         for unit in self.units:
             names = ["bias", "scale", "turn"]
             if unit.force_known.any():
@@ -109,6 +121,7 @@ class Batch:
         """One Gauss-Newton step; `weigh`: set the noise of the inertial units by their residuals first.
 
         That is done once, after the first step: done again and again, the path would follow the units and their noise seem to vanish.
+        Nor below 0.4 of what their samples scatter, vibration included: where the lidar sees nothing, the path is the units' own.
         """
         unknowns = self.unknowns()
         rows = rows_of(self.clusters, self.path, voxel_m, self.most, cut)
@@ -133,13 +146,13 @@ class Batch:
         for unit in self.units:
             turn = turn_factor(unit, self.path, unknowns)
             if weigh:
-                unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), 1e-6)
+                unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), 0.4 * unit.sigma_turn_rad)
                 turn.sigma[:] = unit.sigma_turn_rad
             found.append(turn)
             if unit.force_known.any():
                 force = force_factor(unit, self.path, unknowns)
                 if weigh:
-                    unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), 1e-4)
+                    unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), 0.4 * unit.sigma_force_m_s2)
                     force.sigma[:] = unit.sigma_force_m_s2
                 found.append(force)
             values |= {f"{unit.name}.{name}": value for name, value in unit.values.items()}
@@ -157,6 +170,8 @@ class Batch:
             )
             if factor is not None:
                 found.append(factor)
+        if self.tie is not None:
+            found.append(tie_factor(self.tie, self.path, unknowns))
         found.append(prior_factor(unknowns, values))
         return found
 

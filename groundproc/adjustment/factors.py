@@ -221,7 +221,7 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     second = position[2:] - 2.0 * position[1:-1] + position[:-2]
     # knots 1 to n - 1
     made = dt * H * (up[:-1] + down[1:]) + H * H * GRAVITY
-    whole = unit.force_known.reshape(-1, STEPS).all(axis=1)
+    whole: npt.NDArray[np.bool_] = np.asarray(unit.force_known.reshape(-1, STEPS).all(axis=1))
     good = np.flatnonzero(whole[:-1] & whole[1:])
     knot = good + 1
     residual = (second - made)[good] / H**2
@@ -248,7 +248,7 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
 
 
 def whitened(
-    name: str, residual: Array, matrix: sparse.csr_matrix, time_s: Array, sigma: Array, tau_s: float, white: float
+    name: str, residual: Array, matrix: sparse.csr_matrix, time_s: Array, sigma: Array, tau_s: Array, white: float
 ) -> Factor:
     """Observations whose errors are a Gauss-Markov process and a little white noise: differences that are nearly independent.
 
@@ -259,17 +259,19 @@ def whitened(
     time_s : ndarray, shape (n,)
     sigma : ndarray, shape (n, m)
         Of the process.
-    tau_s, white : float
-        Its time constant, and the sigma of the white part.
+    tau_s : ndarray, shape (m,)
+        Its time constants.
+    white : float
+        Sigma of the white part.
     """
     count, wide = residual.shape
-    keep = np.exp(-np.diff(time_s) / tau_s)
+    keep = np.exp(-np.diff(time_s)[:, None] / tau_s)
     now = np.arange(wide, count * wide)
-    back = sparse.coo_matrix((np.repeat(keep, wide), (now, now - wide)), shape=(count * wide, count * wide))
+    back = sparse.coo_matrix((keep.ravel(), (now, now - wide)), shape=(count * wide, count * wide))
     whiten = (sparse.identity(count * wide) - back).tocsr()
     deviation = np.empty((count, wide))
     deviation[0] = np.hypot(sigma[0], white)
-    deviation[1:] = np.sqrt(sigma[1:] ** 2 * (1.0 - keep[:, None] ** 2) + white**2 * (1.0 + keep[:, None] ** 2))
+    deviation[1:] = np.sqrt(sigma[1:] ** 2 * (1.0 - keep**2) + white**2 * (1.0 + keep**2))
     return Factor(name, whiten @ residual.ravel(), (whiten @ matrix).tocsr(), deviation.ravel())
 
 

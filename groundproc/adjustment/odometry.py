@@ -17,7 +17,7 @@ from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.adjustment.motion import Motion
 from groundproc.adjustment.rotations import mat_of_quat, quat_difference, quat_turned
 from groundproc.adjustment.scans import STEP_NS, STEPS, Clusterer, Slice, voxel_key
-from groundproc.adjustment.voxels import FLATNESS, LEVEL, NORMAL, PlaneMap, find
+from groundproc.adjustment.voxels import FLATNESS, LEVEL, MEAN, NORMAL, TILT, PlaneMap, find
 
 Array = npt.NDArray[np.float64]
 
@@ -31,6 +31,10 @@ SURFACE_SIGMA_M: Final = 0.015
 """What real surfaces differ from the plane of their voxel, one sigma of a cluster."""
 INFLATION: Final = 4.0
 """Neighbouring clusters share their errors: so much is taken off their information."""
+GROUND: Final = 0.966
+"""Cosine of the steepest slope of what counts as ground: 15 deg."""
+FLAT: Final = 1e-3
+"""Share of the information below which a direction counts as not observed."""
 ROUNDS: Final = 4
 
 
@@ -175,6 +179,21 @@ class Odometry:
         keep = np.eye(STATES) - gain @ observed
         s.covariance = keep @ s.covariance @ keep.T + gain @ np.diag(sigma_m**2) @ gain.T
 
+    def attitude_fix(self, quat: Array, sigma_rad: Array) -> None:
+        """Take an attitude of the sensor, shape (4,), with its sigmas about the map's axes."""
+        s = self.state
+        mat = np.empty((3, 3))
+        mat_of_quat(s.quat, mat)
+        off = np.empty(3)
+        quat_difference(s.quat, quat, off)  # in the body
+        observed = np.zeros((3, STATES))
+        observed[:, ROTATION] = mat
+        innovation = observed @ s.covariance @ observed.T + np.diag(sigma_rad**2)
+        gain = np.linalg.solve(innovation, observed @ s.covariance).T
+        self._correct(gain @ (mat @ off))
+        keep = np.eye(STATES) - gain @ observed
+        s.covariance = keep @ s.covariance @ keep.T + gain @ np.diag(sigma_rad**2) @ gain.T
+
     def _correct(self, error: Array) -> None:
         s = self.state
         _apply(error, s.quat, s.position_m, s.velocity_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, s.gravity_m_s2)
@@ -239,73 +258,121 @@ def _propagate(
 
 
 @njit(cache=True, nogil=True)
-def _update(
-    table: Any, keys: Any, voxels: Any, voxel_m: float, body: Any, counts: Any, quat: Any, position: Any, velocity: Any,
-    gyro_bias: Any, accel_bias: Any, gravity: Any, covariance: Any,
+def observable(information: Any) -> Any:
+    """Projection of a pose's correction, shape (6, 6), onto what planes really tell of it.
+
+    Of directions that get less than `FLAT` of the information nothing is taken (after Zhang, Kaess, Singh 2016). Turns count by what
+    they move at the mean distance.
+    """
+    turn = information[0, 0] + information[1, 1] + information[2, 2]
+    shift = information[3, 3] + information[4, 4] + information[5, 5]
+    arm = np.sqrt(max(turn, 1e-12) / max(shift, 1e-12))
+    scaled = information.copy()
+    scaled[:3, :] /= arm
+    scaled[:, :3] /= arm
+    values, vectors = np.linalg.eigh(scaled)
+    known = np.zeros((6, 6))
+    for i in range(6):
+        if values[i] > FLAT * shift:
+            for a in range(6):
+                for b in range(6):
+                    known[a, b] += vectors[a, i] * vectors[b, i]
+    known[:3, 3:] /= arm
+    known[3:, :3] *= arm
+    return known
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(
+    table: Any, keys: Any, voxels: Any, per_m: float, body: Any, counts: Any, mat: Any, position: Any, gate: float,
+    added: Any, pull: Any, level_added: Any, level_pull: Any,
 ) -> Any:  # fmt: skip
-    information = np.linalg.inv(covariance)
-    total = np.zeros(STATES)  # correction so far: the prior pulls back to where it began
-    mat, turn = np.empty((3, 3)), np.empty(3)
-    before = quat.copy()
-    per_m = 1.0 / voxel_m
-    system, right = np.empty((STATES, STATES)), np.empty(STATES)
+    """Information and pull of all clusters that find a plane; and the same with the vertical for the normals of all ground."""
     j = np.empty(6)
-    matched, squares, added = 0, 0.0, np.zeros((6, 6))
-    for attempt in range(ROUNDS):
-        mat_of_quat(quat, mat)
-        added[:, :] = 0.0
-        pull = np.zeros(6)
-        matched, squares = 0, 0.0
-        gate = 0.5 if attempt == 0 else 0.25
-        for n in range(len(body)):
-            bx, by, bz = body[n, 0], body[n, 1], body[n, 2]
-            x = mat[0, 0] * bx + mat[0, 1] * by + mat[0, 2] * bz + position[0]
-            y = mat[1, 0] * bx + mat[1, 1] * by + mat[1, 2] * bz + position[1]
-            z = mat[2, 0] * bx + mat[2, 1] * by + mat[2, 2] * bz + position[2]
-            row = find(table, keys, voxel_key(x, y, z, per_m))
-            if row < 0:
-                continue
-            v = voxels[row]
-            if v[FLATNESS] < 0.0:
-                continue
-            nx, ny, nz = v[NORMAL], v[NORMAL + 1], v[NORMAL + 2]
-            e = nx * x + ny * y + nz * z - v[LEVEL]
-            if abs(e) > gate:
-                continue
-            variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * v[FLATNESS]
-            sigma = np.sqrt(variance)
-            weight = 1.0 / (INFLATION * variance)
-            if abs(e) > 2.0 * sigma:
-                weight *= 2.0 * sigma / abs(e)
+    matched, squares = 0, 0.0
+    added[:, :], level_added[:, :] = 0.0, 0.0
+    pull[:], level_pull[:] = 0.0, 0.0
+    for n in range(len(body)):
+        bx, by, bz = body[n, 0], body[n, 1], body[n, 2]
+        x = mat[0, 0] * bx + mat[0, 1] * by + mat[0, 2] * bz + position[0]
+        y = mat[1, 0] * bx + mat[1, 1] * by + mat[1, 2] * bz + position[1]
+        z = mat[2, 0] * bx + mat[2, 1] * by + mat[2, 2] * bz + position[2]
+        row = find(table, keys, voxel_key(x, y, z, per_m))
+        if row < 0 or voxels[row, FLATNESS] < 0.0:
+            continue
+        v = voxels[row]
+        nx, ny, nz = v[NORMAL], v[NORMAL + 1], v[NORMAL + 2]
+        e = nx * x + ny * y + nz * z - v[LEVEL]
+        if abs(e) > gate:
+            continue
+        # a plane known from a few lines is uncertain away from them
+        off = (x - v[MEAN]) ** 2 + (y - v[MEAN + 1]) ** 2 + (z - v[MEAN + 2]) ** 2
+        variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * v[FLATNESS] + v[TILT] * off
+        weight = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
+        matched += 1
+        squares += e * e
+        for level in range(2):
+            if level:
+                if abs(nz) < GROUND:
+                    for a in range(6):  # as it is: j still holds it
+                        wa = weight * j[a]
+                        level_pull[a] += wa * e
+                        for b in range(a + 1):
+                            level_added[a, b] += wa * j[b]
+                    continue
+                nx, ny, nz = 0.0, 0.0, 1.0 if nz > 0.0 else -1.0
             # normal in the body
             p = nx * mat[0, 0] + ny * mat[1, 0] + nz * mat[2, 0]
             q = nx * mat[0, 1] + ny * mat[1, 1] + nz * mat[2, 1]
             r = nx * mat[0, 2] + ny * mat[1, 2] + nz * mat[2, 2]
             j[0], j[1], j[2] = by * r - bz * q, bz * p - bx * r, bx * q - by * p
             j[3], j[4], j[5] = nx, ny, nz
+            to, of = (level_added, level_pull) if level else (added, pull)
             for a in range(6):
                 wa = weight * j[a]
-                pull[a] += wa * e
+                of[a] += wa * e
                 for b in range(a + 1):
-                    added[a, b] += wa * j[b]
-            matched += 1
-            squares += e * e
-        for a in range(6):
-            for b in range(a):
-                added[b, a] = added[a, b]
-        system[:, :] = information
-        system[:6, :6] += added
-        right[:] = -information @ total
-        right[:6] -= pull
-        change = np.linalg.solve(system, right)
+                    to[a, b] += wa * j[b]
+    for a in range(6):
+        for b in range(a):
+            added[b, a], level_added[b, a] = added[a, b], level_added[a, b]
+    return matched, squares
+
+
+@njit(cache=True, nogil=True)
+def _update(
+    table: Any, keys: Any, voxels: Any, voxel_m: float, body: Any, counts: Any, quat: Any, position: Any, velocity: Any,
+    gyro_bias: Any, accel_bias: Any, gravity: Any, covariance: Any,
+) -> Any:  # fmt: skip
+    to_pose, mine = np.ascontiguousarray(covariance[:, :6]), np.ascontiguousarray(covariance[:6, :6])
+    total = np.zeros(STATES)  # correction so far: the prior pulls back to where it began
+    mat, turn = np.empty((3, 3)), np.empty(3)
+    before = quat.copy()
+    added, pull, level_added, level_pull = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    matched, squares = 0, 0.0
+    for attempt in range(ROUNDS):
+        mat_of_quat(quat, mat)
+        gate = 0.5 if attempt == 0 else 0.25
+        matched, squares = _accumulate(
+            table, keys, voxels, 1.0 / voxel_m, body, counts, mat, position, gate, added, pull, level_added, level_pull
+        )
+        if matched:
+            # normals of flat ground have errors, and thousands of them would seem to hold a place along it: whether anything does is
+            # judged with the vertical for all of them, and where nothing does, that is also what counts
+            known = observable(level_added)
+            if np.trace(known) < 5.5:
+                pull = np.ascontiguousarray(known.T) @ level_pull
+                added = np.ascontiguousarray(known.T) @ level_added @ np.ascontiguousarray(known)
+        # (P^-1 + A)^-1 by Woodbury's formula: P itself may be too nearly singular to invert
+        reach = np.linalg.solve(np.eye(6) + added @ mine, added @ total[:6] - pull)
+        change = to_pose @ reach - total
         total += change
         _apply(change, quat, position, velocity, gyro_bias, accel_bias, gravity)
         # the attitude's correction as one rotation from the prediction
         quat_difference(before, quat, turn)
         total[:3] = turn
-        if (
-            abs(change[0]) + abs(change[1]) + abs(change[2]) < 1e-5
-            and abs(change[3]) + abs(change[4]) + abs(change[5]) < 3e-4
-        ):
+        moved = np.abs(change[:6])
+        if moved[0] + moved[1] + moved[2] < 1e-5 and moved[3] + moved[4] + moved[5] < 3e-4:
             break
-    return matched, np.sqrt(squares / max(matched, 1)), np.linalg.inv(system)
+    left = covariance - to_pose @ np.linalg.solve(np.eye(6) + added @ mine, added @ np.ascontiguousarray(to_pose.T))
+    return matched, np.sqrt(squares / max(matched, 1)), 0.5 * (left + left.T)

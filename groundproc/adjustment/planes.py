@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from groundproc.adjustment.odometry import GROUND, observable
 from groundproc.adjustment.rotations import flattest, mat_of_quat
 from groundproc.adjustment.scans import STEP_NS, STEPS, spread, voxel_key
 from groundproc.adjustment.spline import GRAM, Path, basis
@@ -184,7 +185,26 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
         starts, kept, world, rotation, clusters.xyz_m, clusters.scatter_m2, clusters.count, normals[ids], means[ids], voxel_m, cut, jacobian, plane, weight,
         residual, inverse,
     )  # fmt: skip
-    return Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
+    rows = Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
+    _drop_unobserved(rows, rotation[kept], clusters.xyz_m[kept])
+    return rows
+
+
+def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDArray[np.float32]) -> None:
+    """Take out of the rows of each interval the directions that its planes do not show, as the odometry does.
+
+    `rotation` (local from sensor) and `xyz` are those of the rows' clusters.
+    """
+    level = rows.jacobian.copy()
+    ground = np.flatnonzero(np.abs(level[:, 5]) > GROUND)
+    side = np.sign(level[ground, 5])
+    level[ground, :3] = np.cross(xyz[ground], rotation[ground, 6:9] * side[:, None])
+    level[ground, 3:] = np.stack([0.0 * side, 0.0 * side, side], axis=1)
+    blocks = np.zeros((rows.intervals, 6, 6))
+    _blocks(rows.knot, level, rows.weight, blocks)
+    known = np.array([observable(block) if block[3:, 3:].any() else np.eye(6) for block in blocks])
+    affected = (np.trace(known, axis1=1, axis2=2) < 5.5)[rows.knot]
+    rows.jacobian[affected] = np.einsum("ni,nij->nj", level[affected], known[rows.knot[affected]])
 
 
 @njit(cache=True, nogil=True)
@@ -411,7 +431,7 @@ def _linearise(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _off_plane(i: int, plane: Any, residual: Any, d: float, a: float, b: float) -> float:
+def _off_plane(i: int, plane: Any, residual: Any, d: float, a: float, b: float) -> Any:
     return residual[i] - d - a * plane[i, 0] - b * plane[i, 1]
 
 

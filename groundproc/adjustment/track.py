@@ -1,6 +1,6 @@
 """The forward pass: odometry over a run of the lidar, with what the batch needs of each slice kept."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -11,7 +11,7 @@ from numba import njit
 from flightlog import frames
 from flightlog.constants import STANDARD_GRAVITY_M_S2
 from flightlog.errors import LogError
-from groundproc.adjustment.anchors import Positions
+from groundproc.adjustment.anchors import Attitudes, Positions
 from groundproc.adjustment.motion import Motion
 from groundproc.adjustment.odometry import Odometry, State, Step
 from groundproc.adjustment.planes import Clusters
@@ -30,8 +30,21 @@ LOST_M: Final = 15.0
 LOST_SIGMAS: Final = 6.0
 LOST_FIXES: Final = 8
 """So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew."""
-START_SIGMA: Final = {"tilt_deg": 2.0, "velocity_m_s": 1.0, "gyro_deg_s": 1.0, "accel_m_s2": 0.3, "gravity_m_s2": 0.1}
-"""What is known where the odometry begins."""
+FIX_TAU_S: Final = 1.0
+"""The filter takes positions as if their errors lasted so long: light beside the lidar, and firm enough to hold it where there is none."""
+ATTITUDE_EVERY_NS: Final = 1_000_000_000
+ATTITUDE_FIX_RAD: Final = np.deg2rad([3.0, 3.0, 30.0])
+"""The autopilot's attitude is taken once a second with these sigmas, about east, north and up; light in the same way."""
+FEWEST: Final = 20
+"""Slices that make a track."""
+START_SIGMA: Final = {
+    "attitude_deg": 0.02,
+    "velocity_m_s": 1.0,
+    "gyro_deg_s": 1.0,
+    "accel_m_s2": 0.3,
+    "gravity_m_s2": 0.3,
+}
+"""What is known where the odometry begins. The map takes its axes from the first attitude, so that is exact, and gravity is not."""
 
 
 @dataclass(slots=True)
@@ -104,6 +117,11 @@ class Track:
         quat[-1], position[-1] = quats[-1], places[-1]
         return Path(motion.start_ns + self.first * SLICE_NS, quat, position)
 
+    def forget(self, before: int) -> None:
+        """Drop the clusters of the slices before one."""
+        for i in range(before):
+            self.clusters[i] = _NONE
+
     def gathered(self, start: int, end: int) -> Clusters:
         """Clusters of slices `start` to `end` as columns."""
         parts = self.clusters[start:end]
@@ -130,17 +148,18 @@ class Tracker:
     fixes : Positions or None
     keep : bool
         Whether clusters are kept for the batch.
+    attitudes : Attitudes, optional
     """
 
     def __init__(
         self, motion: Motion, start: Trajectory, mat_ins_lidar: Array, lever_m: Array, gyro_bias: Array,
-        fixes: Positions | None, keep: bool = True,
+        fixes: Positions | None, keep: bool = True, attitudes: Attitudes | None = None,
     ) -> None:  # fmt: skip
         self.motion, self._start, self._mat, self._lever = motion, start, mat_ins_lidar, lever_m
-        self._bias, self._fixes, self._keep = gyro_bias, fixes, keep
+        self._bias, self._fixes, self._keep, self._attitudes = gyro_bias, fixes, keep, attitudes
         self.odometry: Odometry | None = None
         self.track: Track | None = None
-        self._next_fix, self._far = 0, 0
+        self._next_fix, self._far, self._next_attitude_ns = 0, 0, 0
 
     def feed(self, piece: Slice) -> Step | None:
         """Take the next slice; None before the start, and where the inertial data have ended."""
@@ -155,9 +174,11 @@ class Tracker:
             return None
         while self.odometry.number < piece.number:  # nothing was seen
             self.odometry.propagate(self.odometry.number)
+            self._take_attitude()
             self._take_fixes()
             self._note(None)
         step = self.odometry.step(piece)
+        self._take_attitude()
         self._take_fixes()
         self._note(step)
         return step
@@ -178,6 +199,28 @@ class Tracker:
         else:
             track.clusters.append(thinned(step.clusters, step.world_m, self.odometry.map, KEPT))  # type: ignore[union-attr]
 
+    def _take_attitude(self) -> None:
+        """The autopilot's attitude of now, once a second."""
+        given, odometry = self._attitudes, self.odometry
+        if given is None or odometry is None:
+            return
+        now_ns = self.motion.start_ns + odometry.number * SLICE_NS
+        i = int(np.searchsorted(given.time_ns, now_ns)) - 1
+        if now_ns < self._next_attitude_ns or i < 0:
+            return
+        age_s = (now_ns - int(given.time_ns[i])) * 1e-9
+        if age_s > 0.2:
+            return
+        rate = self.motion.rate_rad_s[max(odometry.number * STEPS - STEPS, 0) : odometry.number * STEPS].mean(axis=0)
+        turn = age_s * (rate - odometry.state.gyro_bias_rad_s)
+        mat = (
+            frames.mat_from_quat(given.quat[i][None])[0]
+            @ self._mat
+            @ frames.mat_from_quat(frames.quat_exp(turn[None]))[0]
+        )
+        odometry.attitude_fix(frames.quat_from_mat(mat[None])[0], ATTITUDE_FIX_RAD)
+        self._next_attitude_ns = now_ns + ATTITUDE_EVERY_NS
+
     def _take_fixes(self) -> None:
         """Fixes up to now; their errors last, so each counts for little, and only where the lidar cannot tell."""
         fixes, odometry = self._fixes, self.odometry
@@ -194,7 +237,7 @@ class Tracker:
             state = odometry.state
             mat = frames.mat_from_quat(state.quat[None])[0]
             place = fixes.position_m[i] + age_s * state.velocity_m_s - mat @ fixes.lever_m
-            sigma = fixes.sigma_m[i] * np.sqrt(max(2.0 * fixes.tau_s * rate_hz, 1.0))
+            sigma = fixes.sigma_m[i] * np.sqrt(max(2.0 * FIX_TAU_S * rate_hz, 1.0))
             off = np.abs(place - state.position_m)
             self._far = self._far + 1 if (off > np.maximum(LOST_M, LOST_SIGMAS * fixes.sigma_m[i])).any() else 0
             odometry.position_fix(place, sigma)
@@ -202,7 +245,8 @@ class Tracker:
                 self._restart()
 
     def _restart(self) -> None:
-        assert self.odometry is not None and self.track is not None
+        assert self.odometry is not None
+        assert self.track is not None
         state = self._state_at(self.odometry.number)
         if state is not None:
             self.odometry.state, self.odometry.map = state, PlaneMap(VOXEL_M)
@@ -228,7 +272,7 @@ class Tracker:
         s = START_SIGMA
         sigma = np.concatenate(
             [
-                np.full(3, np.deg2rad(s["tilt_deg"])), np.full(3, 1e-3), np.full(3, s["velocity_m_s"]),
+                np.full(3, np.deg2rad(s["attitude_deg"])), np.full(3, 1e-3), np.full(3, s["velocity_m_s"]),
                 np.full(3, np.deg2rad(s["gyro_deg_s"])), np.full(3, s["accel_m_s2"]),
                 np.array([s["gravity_m_s2"], s["gravity_m_s2"], 1e-4]),
             ]
@@ -239,22 +283,21 @@ class Tracker:
         return State(quat, places[0].copy(), velocity, bias.copy(), np.zeros(3), gravity, np.diag(sigma**2))
 
 
-def follow(pieces: Iterator[Slice], tracker: Tracker) -> Track:
-    """Feed all slices.
+def tracked(tracker: Tracker) -> Track:
+    """The track, when all slices are fed.
 
     Raises
     ------
     LogError
-        Not one of them could be placed.
+        Not enough of them could be placed.
     """
-    for piece in pieces:
-        tracker.feed(piece)
-    if tracker.track is None or len(tracker.track) < 20:
+    track = tracker.track
+    if track is None or len(track) < FEWEST:
         raise LogError(
-            f"adjusted: {0 if tracker.track is None else len(tracker.track)} tenths of a second with lidar, inertial data and position "
-            "together, expected 20 or more"
+            f"adjusted: {0 if track is None else len(track)} tenths of a second with lidar, inertial data and position together, "
+            f"expected {FEWEST} or more"
         )
-    return tracker.track
+    return track
 
 
 _NONE: Final = np.empty(0, CLUSTER_DTYPE)

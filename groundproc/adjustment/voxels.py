@@ -11,16 +11,18 @@ from groundproc.adjustment.scans import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 
-COUNT, MEAN, SCATTER, NORMAL, LEVEL, FLATNESS = 0, 1, 4, 10, 13, 14
+COUNT, MEAN, SCATTER, NORMAL, LEVEL, FLATNESS, TILT = 0, 1, 4, 10, 13, 14, 15
 """Columns of a voxel: returns; their mean (3); scatter about it (6); normal (3); its distance from the origin; variance along it,
-negative where it is no plane."""
-COLUMNS: Final = 15
+negative where it is no plane; variance of the normal's direction."""
+COLUMNS: Final = 16
+LEAST_FLATNESS_M2: Final = 1e-4
+"""Returns of one ring share errors: a plane's deviation is taken to be 1 cm at least where its tilt is judged."""
 
 FEWEST: Final = 12
 """Returns that make a plane."""
 FLATTEST_M: Final = 0.05
 """Deviation from a plane beyond which a voxel is none, one sigma [m]."""
-NARROWEST: Final = 0.12
+NARROWEST: Final = 0.16
 """Least width of the returns across the plane's narrow side, one sigma, in voxels: a single ring on the ground is no plane."""
 
 
@@ -139,4 +141,5 @@ def _insert(
                 v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
                 v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
                 v[FLATNESS] = max(low, 0.0)
+                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, 400.0) * middle)
     return count

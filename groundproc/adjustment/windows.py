@@ -1,0 +1,199 @@
+"""Windows of a long flight: each a batch of its own, tied to the one before where they overlap, and joined into one path."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter1d
+
+from flightlog import frames
+from groundproc.adjustment.anchors import Attitudes, Positions, Tie
+from groundproc.adjustment.batch import DRAWS, Batch, Posterior, make_unit
+from groundproc.adjustment.factors import H
+from groundproc.adjustment.motion import ImuTrack, Motion
+from groundproc.adjustment.scans import STEPS
+from groundproc.adjustment.spline import Path
+from groundproc.adjustment.track import Track
+
+Array = npt.NDArray[np.float64]
+
+WINDOW: Final = 2400
+"""Slices of a window, four minutes: most flights of a multirotor are one to three windows, and one takes about 1 GB."""
+OVERLAP: Final = 200
+MISALIGNMENT_RAD: Final = np.deg2rad(0.2)
+"""How far the axes of a cheap gyro are from those of its board (cross-axis sensitivity of its class, one sigma): the boresight is found
+through the gyro, and no flight tells the two apart."""
+
+
+@dataclass(slots=True)
+class Sources:
+    """What the batch needs besides the lidar.
+
+    Attributes
+    ----------
+    units : mapping of str to ImuTrack
+        "lidar", "ins" or both.
+    positions, attitudes
+    mat_ins_lidar, lever_m : ndarray
+        Nominal mount.
+    """
+
+    units: Mapping[str, ImuTrack]
+    positions: Sequence[Positions]
+    attitudes: Sequence[Attitudes]
+    mat_ins_lidar: Array
+    lever_m: Array
+
+
+@dataclass(slots=True)
+class Window:
+    """One adjusted window.
+
+    Attributes
+    ----------
+    first, last : int
+        Slices, counted from the track's first.
+    own : int
+        Slices until the next window's begin; all of them for the last.
+    path : Path
+    values : dict of str to (ndarray, ndarray)
+        Globals and their sigmas.
+    sigma_position_m, sigma_attitude_rad : ndarray, shape (slices + 1, 3)
+        At slice boundaries: east, north, up; roll, pitch, heading; of the ins frame.
+    log : list of dict
+        What each Gauss-Newton step said.
+    """
+
+    first: int
+    last: int
+    own: int
+    path: Path
+    values: dict[str, tuple[Array, Array]]
+    sigma_position_m: Array
+    sigma_attitude_rad: Array
+    log: list[dict[str, float]]
+
+
+def adjust_window(
+    track: Track, motion: Motion, sources: Sources, first: int, last: int, before: Sequence[Window]
+) -> Window:
+    """Adjust slices `first` to `last` of a track, tied to the last of the windows `before`."""
+    path, tie = track.path(motion, first, last), None
+    if before:
+        previous = before[-1]
+        previous.own = first - previous.first
+        common = slice((first - previous.first) * STEPS, (first - previous.first + OVERLAP) * STEPS, STEPS)
+        tie = Tie(previous.path.quat[common], previous.path.position_m[common])
+        path = _laid_on(path, tie)
+    mat, lever = sources.mat_ins_lidar, sources.lever_m
+    to_ins = -mat.T @ lever
+    bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
+    units = [
+        make_unit(
+            name,
+            unit,
+            path,
+            bias if unit.name == motion.source else np.zeros(3),
+            np.zeros(3) if name == "lidar" else to_ins,
+        )
+        for name, unit in sources.units.items()
+    ]
+    batch = Batch(
+        path,
+        track.gathered(first, last),
+        units,
+        dict(sources.units),
+        sources.positions,
+        sources.attitudes,
+        mat.T,
+        to_ins,
+        tie=tie,
+    )
+    posterior = batch.run()
+    draws = posterior.draws(DRAWS)
+    position, attitude = _sigmas(batch.path, posterior, draws, mat, lever, motion.rate_density)
+    if before:
+        old = before[-1]
+        position = np.hypot(position, old.sigma_position_m[old.own])
+        attitude = np.hypot(attitude, old.sigma_attitude_rad[old.own])
+    return Window(
+        first, last, last - first, batch.path, _values(batch, posterior, draws), position, attitude, batch.log
+    )
+
+
+def _laid_on(path: Path, tie: Tie) -> Path:
+    """The path turned and moved as a whole so that its begin lies on a tie."""
+    count = len(tie.quat)
+    quat, place = path.quat[: count * STEPS : STEPS], path.position_m[: count * STEPS : STEPS]
+    off = frames.quat_log(frames.quat_multiply(tie.quat, frames.quat_inverse(quat)))
+    mat = frames.mat_from_quat(frames.quat_exp(off.mean(axis=0)[None]))[0]
+    return path.turned(mat, (tie.position_m - place @ mat.T).mean(axis=0))
+
+
+def _values(batch: Batch, posterior: Posterior, draws: Array) -> dict[str, tuple[Array, Array]]:
+    """Globals with the sigmas of the draws."""
+    found = {}
+    for name, where in posterior.unknowns.names.items():
+        unit, _, key = name.partition(".")
+        if unit == "world":
+            continue
+        sigma = np.sqrt(np.mean(np.square(draws[:, where]), axis=0))
+        if name == "ins.turn":
+            sigma = np.hypot(sigma, MISALIGNMENT_RAD)
+        value = batch.compass if name == "compass" else next(u for u in batch.units if u.name == unit).values[key]
+        found[name] = (value, sigma)
+    return found
+
+
+def _sigmas(
+    path: Path, posterior: Posterior, draws: Array, mat_ins_lidar: Array, lever: Array, rate_density: float
+) -> tuple[Array, Array]:
+    """Sigmas of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
+    unknowns = posterior.unknowns
+    quat, place = path.quat[::STEPS], path.position_m[::STEPS]
+    mats = frames.mat_from_quat(quat)
+    to_ins = -mat_ins_lidar.T @ lever
+    squares_position, squares_attitude = np.zeros((len(quat), 3)), np.zeros((len(quat), 3))
+    heading = frames.attitude_of(mats @ mat_ins_lidar.T)[0]
+    right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
+    ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
+    for draw in draws:
+        part = {name: draw[where] for name, where in unknowns.names.items()}
+        spline = draw[: unknowns.path_size].reshape(-1, 6)
+        at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
+        in_body = at[:, :3] + part.get("ins.turn", np.zeros(3))
+        turn = np.einsum("nij,nj->ni", mats, in_body) + part["world.turn"]
+        arm = np.cross(at[:, :3], to_ins) + part.get("ins.lever", np.zeros(3))
+        moved = at[:, 3:] + np.cross(part["world.turn"], place) + part["world.shift"]
+        squares_position += np.square(moved + np.einsum("nij,nj->ni", mats, arm))
+        squares_attitude += np.square(
+            np.stack([(turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1), turn[:, 2]], axis=1)
+        )
+    if "ins.turn" in unknowns.names:
+        squares_attitude += len(draws) * MISALIGNMENT_RAD**2
+    # what the gyro adds between two knots, the mean of a Brownian bridge
+    bridge = rate_density**2 * H / 6.0
+    position, attitude = (
+        uniform_filter1d(s / len(draws), 11, axis=0, mode="nearest") for s in (squares_position, squares_attitude)
+    )
+    return np.sqrt(position), np.sqrt(attitude + bridge)
+
+
+def joined_path(windows: Sequence[Window]) -> Path:
+    """The windows' paths as one, each faded into the next over their overlap."""
+    path = windows[0].path
+    for window in windows[1:]:
+        begin = (window.first - windows[0].first) * STEPS
+        shared = len(path.quat) - begin
+        share = np.linspace(0.0, 1.0, shared)[:, None]
+        turn = frames.quat_log(frames.quat_multiply(frames.quat_inverse(path.quat[begin:]), window.path.quat[:shared]))
+        quat = frames.quat_multiply(path.quat[begin:], frames.quat_exp(share * turn))
+        place = path.position_m[begin:] + share * (window.path.position_m[:shared] - path.position_m[begin:])
+        path = Path(
+            path.start_ns,
+            np.concatenate([path.quat[:begin], quat, window.path.quat[shared:]]),
+            np.concatenate([path.position_m[:begin], place, window.path.position_m[shared:]]),
+        )
+    return path
