@@ -67,7 +67,9 @@ class Flight:
 LINES = [(-75, -28), (75, -28), (75, 0), (-75, 0), (-75, 28), (75, 28), (75, 45), (0, 45), (0, -60)]
 
 
-def flown(corners: list[tuple[float, float]] = LINES, speed: float = 9.0, high: float = 48.0) -> Flight:
+def flown(
+    corners: list[tuple[float, float]] = LINES, speed: float = 9.0, high: float = 48.0, sway: float = 1.0
+) -> Flight:
     """A flight along corners, leaning and swaying a little."""
     points = np.array([(x, y, high) for x, y in corners], float)
     legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -77,8 +79,8 @@ def flown(corners: list[tuple[float, float]] = LINES, speed: float = 9.0, high: 
     course = np.diff(rough[:, :2], axis=0, append=rough[-1:, :2])
     course[-1] = course[-2]
     yaw = gaussian_filter1d(np.unwrap(np.arctan2(-course[:, 0], course[:, 1])), 80, mode="nearest")
-    pitch = np.deg2rad(2.5) * np.sin(2 * np.pi * time / 3.1)
-    roll = np.deg2rad(3.0) * np.sin(2 * np.pi * time / 4.3 + 1)
+    pitch = sway * np.deg2rad(2.5) * np.sin(2 * np.pi * time / 3.1)
+    roll = sway * np.deg2rad(3.0) * np.sin(2 * np.pi * time / 4.3 + 1)
     place[:, 0] += 0.3 * np.sin(2 * np.pi * time / 7)
     return Flight(time, place + PLACE, Rotation.from_euler("ZXY", np.stack([yaw, pitch, roll], axis=1)))
 

@@ -121,14 +121,14 @@ def test_over_open_water_the_points_are_as_they_were(tmp_path: Path, adjust: Cal
 
 
 def test_what_strips_cannot_tell_is_held(tmp_path: Path, adjust: Callable[..., Any]) -> None:
-    """Three passes along one line in one direction: the lever arm shifts all of them alike, whatever it is."""
+    """Three passes in one direction and without swaying: the lever arm shifts all of them alike, whatever it is."""
     there = [(-60, 0), (60, 0)]
-    passes = [aerial.flown(there) for _ in range(3)]
-    seconds = passes[0].time_s[-1]
+    once = aerial.flown(there, sway=0.0)
+    seconds = once.time_s[-1]
     step = aerial.STEP_S
     time = np.arange(0, 3 * (seconds + 10), step)
     one = np.clip(time % (seconds + 10), 0, seconds)
-    place, attitude = passes[0].at(one)
+    place, attitude = once.at(one)
     place[:, 1] += 12 * (time // (seconds + 10))
     scan = aerial.scanned(aerial.Flight(time, place, attitude), aerial.Errors(0.1, 0.02))
     keep = scan.time_s % (seconds + 10) < seconds
@@ -313,3 +313,58 @@ def test_input_is_never_written_over(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_the_corrected_file_is_of_the_same_crs_for_others(adjusted: Any) -> None:
     crs = laspy.read(adjusted.folder / "cloud.laz").header.parse_crs()
     assert crs.equals(pyproj.CRS.from_epsg(aerial.EPSG))
+
+
+@pytest.mark.parametrize(("version", "point_format"), [("1.2", 1), ("1.3", 3), ("1.4", 6), ("1.4", 8)])
+def test_files_of_all_versions_keep_what_they_hold(tmp_path: Path, version: str, point_format: int) -> None:
+    """Scaled extra bytes, extended records and odd scales too."""
+    scan = aerial.scanned(aerial.flown([(-40, 0), (40, 0), (40, 10), (-40, 10)]), aerial.Errors(0.1), rate_hz=1500)
+    header = laspy.LasHeader(version=version, point_format=point_format)
+    header.scales, header.offsets = np.array([0.01, 0.001, 0.0005]), np.array([500_000.0, 6_400_000.0, 0.0])
+    header.add_extra_dim(
+        laspy.ExtraBytesParams("range", np.uint16, "range [m]", scales=np.array([0.002]), offsets=np.array([0.0]))
+    )
+    header.add_crs(pyproj.CRS.from_epsg(aerial.EPSG), keep_compatibility=version != "1.4")
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = scan.placed_m.T
+    cloud.gps_time = aerial.START_NS * 1e-9 + aerial.GPS_MINUS_UNIX_S + scan.time_s - 1e9
+    cloud["range"] = np.full(len(scan.time_s), 12.34)
+    cloud.return_number = np.full(len(scan.time_s), 2, np.uint8)
+    cloud.number_of_returns = np.full(len(scan.time_s), 3, np.uint8)
+    if version == "1.4":
+        cloud.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("somebody", 5, "long record", bytes(range(256)) * 300)])
+    cloud.write(tmp_path / "cloud.las")
+    aerial.write_csv(tmp_path / "given.csv", scan.wrong)
+    words = [str(tmp_path / "cloud.las"), "-t", str(tmp_path / "given.csv"), "-o", str(tmp_path / "out")]
+    assert main(["adjust", *words]) == 0
+    new = laspy.read(tmp_path / "out" / "cloud.laz")
+    assert str(new.header.version) == version
+    assert new.header.point_format.id == point_format
+    assert not (new.points.array == cloud.points.array).all()  # it was adjusted
+    for name in cloud.point_format.dimension_names:
+        if name not in ("X", "Y", "Z"):
+            assert (np.asarray(cloud[name]) == np.asarray(new[name])).all(), name
+    np.testing.assert_allclose(np.asarray(new["range"]), 12.34, atol=1e-9)
+    assert new.header.number_of_points_by_return[1] == len(scan.time_s)
+    assert new.header.parse_crs().to_epsg() == aerial.EPSG
+    if version == "1.4":
+        assert [v.record_data for v in new.evlrs if v.user_id == "somebody"] == [bytes(range(256)) * 300]
+
+
+def test_options_are_listed_and_wrong_ones_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], adjusted: Any
+) -> None:
+    assert main(["adjust", "--show-config"]) == 0
+    shown = capsys.readouterr().out
+    assert "knots_s: 2.0" in shown
+    (tmp_path / "all.yaml").write_text(shown)
+    (tmp_path / "bad.yaml").write_text("knots_s: 0")
+    cloud, track = adjusted.folder.parent / "cloud.laz", adjusted.folder.parent / "given.csv"
+    words = [str(cloud), "-t", str(track), "-o", str(tmp_path / "out")]
+    assert main(["adjust", *words, "--config", str(tmp_path / "bad.yaml")]) == 2
+    assert "knots_s: 0" in capsys.readouterr().err
+    assert main(["adjust", *words, "--config", str(tmp_path / "all.yaml"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["adjusted"]
+    assert main(["adjust", str(cloud)]) == 2
+    assert "-t is missing" in capsys.readouterr().err
