@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
+from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.adjustment.anchors import Attitudes, Positions
@@ -21,6 +22,7 @@ from groundproc.adjustment.scans import STEP_NS, STEPS, slices
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track, Tracker, grid_ns, tracked
 from groundproc.adjustment.windows import OVERLAP, WINDOW, Sources, Window, adjust_window, joined_path
+from groundproc.autopilot import Boot
 from groundproc.geodesy import LocalFrame
 from groundproc.timeline import Leg
 from groundproc.trajectory import ins
@@ -357,14 +359,32 @@ def position_track(given: Given, leg: Leg) -> Positions:
     place = given.frame.from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
+    good = measured(leg.boot, fixes.time_ns)
     return Positions(
-        leg.utc_from_boot(fixes.time_ns),
-        place,
-        np.maximum(fixes.sigma_m, LEAST_POSITION_SIGMA_M),
+        leg.utc_from_boot(fixes.time_ns[good]),
+        place[good],
+        np.maximum(fixes.sigma_m[good], LEAST_POSITION_SIGMA_M),
         mat.T @ (antenna - lever),
         POSITION_TAU_S,
         POSITION_WHITE_M,
     )
+
+
+RECOVERY_NS: Final = 30 * NS_PER_S
+"""So long after a fix is back, the autopilot's position still comes back from where it had drifted to."""
+
+
+def measured(boot: Boot, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Which positions rest on satellites: without a fix an autopilot goes on with a position that drifts away, and says so elsewhere."""
+    if not boot.has("GPS_RAW_INT", 2):
+        return np.ones(len(time_ns), np.bool_)
+    gps_ns, fixed = boot.stamps_ns["GPS_RAW_INT"], boot.tables["GPS_RAW_INT"]["fix_type"] >= 3
+    row = np.clip(np.searchsorted(gps_ns, time_ns, side="right") - 1, 0, len(gps_ns) - 1)
+    # a message late: between the last with a fix and the first without, it may be lost already
+    good = fixed[row] & fixed[np.minimum(row + 1, len(fixed) - 1)]
+    for regained_ns in gps_ns[1:][fixed[1:] & ~fixed[:-1]].tolist():
+        good &= (time_ns < regained_ns) | (time_ns > regained_ns + RECOVERY_NS)
+    return np.asarray(good if good.sum() >= 2 else np.ones(len(time_ns), np.bool_))
 
 
 def attitude_track(leg: Leg) -> Attitudes | None:
