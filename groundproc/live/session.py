@@ -152,7 +152,7 @@ class Session:
         ----------
         is_over : callable
         tell : callable
-            Is given the status once a second.
+            Is given the status once a second, and at the end.
         idle_s : float, optional
 
         Raises
@@ -165,7 +165,8 @@ class Session:
             items = self._inbox.take(_WAIT_S)
             for item in items:
                 self._take(item)
-            self._advance()
+                # after each: a log that is there already comes in seconds at a time
+                self._advance()
             now_s = time.monotonic()
             if now_s - told_s >= 1.0:
                 told_s = now_s
@@ -181,6 +182,7 @@ class Session:
         self._estimator.sync.wait()
         self._trajectory.flush()
         self.status = self._describe(time.monotonic())
+        tell(self.status)
         return Summary(self._places, self.cloud.count, time.monotonic() - begun_s, self.worst_lag_s, self.status)
 
     @property

@@ -205,6 +205,65 @@ def test_without_the_lidars_own_unit_the_autopilots_carries_it(tmp_path: Path, f
     assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < 3 * POSITION_RMS_M
 
 
+def told_of(log: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What the last line of JSON says after a log was followed."""
+    capsys.readouterr()
+    assert main(["live", "--follow", str(log), "--port", "0", "--json", "-o", str(out)]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
+    last: dict[str, Any] = json.loads(lines[-1])
+    return last
+
+
+def test_an_autopilot_that_starts_again_is_tied_again(
+    tmp_path: Path, rebooted_flight: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = told_of(rebooted_flight.log, tmp_path / "live", capsys)
+    assert status["counts"]["reboots"] == 1
+    assert status["counts"]["clock_jumps"] == 0
+    boot, lidar = rebooted_flight.truth["clocks"]["boot"], rebooted_flight.truth["clocks"]["lidar"]
+    before_s = (boot["start_ns"] - lidar["start_ns"]) * 1e-9
+    assert status["sync"] is not None
+    # the new boot's clock began some 20 s after the old one's: an offset that is older by that and by whole hours
+    off_s = (status["sync"]["offset_s"] - before_s) % 3600.0
+    assert off_s > 10.0
+    assert off_s < 3600.0 - 10.0
+    assert len(rows(tmp_path / "live")) > 10 * 35
+
+
+def test_a_lidar_clock_that_is_set_in_flight_begins_anew_in_the_same_frame(
+    tmp_path: Path, flight: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jumped, cut_ns = tmp_path / "jumped.mcap", 0
+    with LogReader(flight.log) as reader, jumped.open("wb") as file:
+        cut_ns = (reader.start_ns + reader.end_ns) // 2
+        writer = LogWriter(file, metadata=dict(reader.metadata), attachments=dict(reader.attachments))
+        for message in reader.messages():
+            data = bytes(message.data)
+            if message.topic == records.LIDAR.topic and message.log_time_ns > cut_ns:
+                packets = records.decode_scan(data)
+                packets["data"]["stamp_us"] = (packets["data"]["stamp_us"] + 1_000_000_000) % 3_600_000_000
+                data = records.encode_scan(message.log_time_ns, packets)
+            elif message.topic == records.POSITION.topic and message.log_time_ns > cut_ns:
+                times, samples = records.decode_position(data)
+                samples = samples.copy()
+                samples["stamp_us"] = (samples["stamp_us"] + 1_000_000_000) % 3_600_000_000
+                chunks = [(int(t), np.asarray(each).tobytes()) for t, each in zip(times, samples, strict=True)]
+                data = records.encode_raw(message.log_time_ns, chunks, "velodyne")
+            writer.write(message.topic, message.log_time_ns, data)
+        writer.finish()
+    status = told_of(jumped, tmp_path / "live", capsys)
+    assert status["counts"]["clock_jumps"] >= 1
+    table = rows(tmp_path / "live")
+    assert (np.diff(table["utc_ns"]) > 0).all()
+    steps = np.diff(table["lidar_ns"])
+    (jump,) = np.flatnonzero(np.abs(steps) > 900 * 10**9)
+    assert min(jump, len(table) - jump) > 20
+    # metres apart as the autopilot's positions are wrong, and not in another frame
+    places = np.stack([table[name] for name in ("east_m", "north_m", "up_m")], axis=1)
+    flown_m = 5.0 * (table["utc_ns"][jump + 1] - table["utc_ns"][jump]) * 1e-9
+    assert np.linalg.norm(places[jump + 1] - places[jump]) < flown_m + 3 * 5.0
+
+
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
