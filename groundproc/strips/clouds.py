@@ -40,7 +40,7 @@ class Cloud:
     path : Path
     points : int
     week_time : bool
-        Times are seconds of the GPS week; else adjusted standard GPS time.
+        Times are seconds of the GPS week; else adjusted standard GPS time. As the header says, unless the times cannot be that.
     crs : pyproj.CRS or None
         Horizontal part of the file's CRS.
     """
@@ -95,9 +95,13 @@ def look(path: Path) -> Cloud:
             crs = header.parse_crs()
         except CRSError as error:
             raise CaptureError(f"{path}: its CRS cannot be understood ({error})") from None
-        return Cloud(
-            path, header.point_count, header.global_encoding.gps_time_type != GpsTimeType.STANDARD, _horizontal(crs)
-        )
+        weekly = header.global_encoding.gps_time_type != GpsTimeType.STANDARD
+        if weekly:
+            # many programs leave the bit unset with times that no week has
+            some = next(_records(path, reader))
+            time = np.asarray(some.gps_time, np.float64)
+            weekly = bool(((time >= 0.0) & (time < 2.0 * WEEK_NS / NS_PER_S)).all())
+        return Cloud(path, header.point_count, weekly, _horizontal(crs))
 
 
 def _horizontal(crs: pyproj.CRS | None) -> pyproj.CRS | None:

@@ -21,7 +21,7 @@ _ALIKE: Final = 0.985
 """Cosine between the normals of two planes that are one surface (10 deg)."""
 _MOST: Final = 64
 """Strips that are compared in one voxel, at most."""
-_LIMIT: Final = 1_500_000
+_LIMIT: Final = 600_000
 """Voxels of strips that are kept."""
 
 

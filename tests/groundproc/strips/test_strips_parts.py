@@ -13,6 +13,7 @@ from groundproc.adjustment.factors import Unknowns
 from groundproc.adjustment.planes import TILT_PRIOR
 from groundproc.geodesy import projected_crs
 from groundproc.strips.adjust import Linear, Sigmas, constant_prior, wandering
+from groundproc.strips.clouds import Clock, chunks, look
 from groundproc.strips.clusters import CLUSTER, Gatherer
 from groundproc.strips.correction import Correction
 from groundproc.strips.cutting import BIN_NS, Occupancy
@@ -319,6 +320,23 @@ def test_strips_end_at_gaps_and_follow_their_ids(route: Route) -> None:
     assert by_id.by.startswith("point source id")
     # two scanners at once, or tiles: ids that alternate are no strips
     assert occupied(route, np.arange(count) // 2 % 2).cut(2.0, 45.0).by.startswith("turns")
+
+
+def test_stamps_of_both_kinds_and_of_careless_programs_are_the_same_utc(tmp_path: Path) -> None:
+    scan = aerial.scanned(aerial.flown([(-10, 0), (10, 0)]), aerial.Errors(), rate_hz=200)
+    wanted = aerial.START_NS + np.rint(scan.time_s * 1e9)
+    standard = aerial.START_NS * 1e-9 + aerial.GPS_MINUS_UNIX_S + scan.time_s - 1e9
+    for named, weekly in (
+        ({}, False),
+        ({"week_time": True}, True),
+        ({"week_time": True, "gps_s": standard}, False),  # the bit is not set, the times are standard
+    ):
+        aerial.write_las(tmp_path / "c.laz", scan, scan.placed_m, **named)
+        cloud = look(tmp_path / "c.laz")
+        assert cloud.week_time == weekly
+        (chunk,) = chunks([cloud], Clock(near_utc_ns=aerial.START_NS + 3 * 86_400 * 10**9))
+        # a double of adjusted standard time resolves 60 ns, of Unix seconds 240 ns
+        np.testing.assert_allclose(chunk.time_ns - aerial.START_NS, wanted - aerial.START_NS, atol=500)
 
 
 def test_a_bad_control_file_names_its_line(tmp_path: Path) -> None:
