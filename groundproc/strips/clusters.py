@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.adjustment.scans import voxel_key
+from groundproc.adjustment.scans import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -113,23 +113,11 @@ def merged(parts: npt.NDArray[np.void], voxel_m: float) -> npt.NDArray[np.void]:
 _SIX: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _hash(key: Any) -> Any:
-    """Hash of a key, 0 to 2^31 - 1, even in its high bits too (the finaliser of MurmurHash 3): thinning must leave no pattern."""
-    h = np.uint64(key)
-    h ^= h >> np.uint64(33)
-    h *= np.uint64(0xFF51AFD7ED558CCD)
-    h ^= h >> np.uint64(33)
-    h *= np.uint64(0xC4CEB9FE1A85EC53)
-    h ^= h >> np.uint64(33)
-    return np.int64(h & np.uint64(0x7FFFFFFF))
-
-
 @njit(cache=True, nogil=True)
 def _hashes(place: Any, voxel_m: float) -> Any:
     out = np.empty(len(place), np.int64)
     for i in range(len(place)):
-        out[i] = _hash(voxel_key(place[i, 0], place[i, 1], place[i, 2], 1.0 / (COARSE * voxel_m)))
+        out[i] = spread(voxel_key(place[i, 0], place[i, 1], place[i, 2], 1.0 / (COARSE * voxel_m)))
     return out
 
 
@@ -139,7 +127,7 @@ def _keys(split: Any, xyz: Any, voxel_m: float, below: int) -> Any:
     keys, kept, count = np.empty(len(split), np.int64), np.empty(len(split), np.int64), 0
     for i in range(len(split)):
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        if below < _ALL and _hash(voxel_key(x, y, z, 1.0 / (COARSE * voxel_m))) >= below:
+        if below < _ALL and spread(voxel_key(x, y, z, 1.0 / (COARSE * voxel_m))) >= below:
             continue
         key = voxel_key(x, y, z, 1.0 / voxel_m)
         # a mix of both; two clusters that meet by chance, one in 1e7 of a chunk's, are told apart by their scatter
