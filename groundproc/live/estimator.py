@@ -14,7 +14,16 @@ from flightlog.mount import Mount
 from groundproc.adjustment.motion import INS_FORCES, LEAST_BASE_HZ, Motion
 from groundproc.adjustment.scans import SLICE_NS, Slice
 from groundproc.adjustment.spline import Path
-from groundproc.adjustment.track import LOST_FIXES, LOST_M, LOST_SIGMAS, Track, Tracker
+from groundproc.adjustment.track import (
+    ATTITUDE_EVERY_NS,
+    ATTITUDE_FIX_RAD,
+    FIX_TAU_S,
+    LOST_FIXES,
+    LOST_M,
+    LOST_SIGMAS,
+    Track,
+    Tracker,
+)
 from groundproc.autopilot import Boot
 from groundproc.decode import Gate
 from groundproc.geodesy import LocalFrame
@@ -35,8 +44,6 @@ LEAST_SAMPLES_NS: Final = 3 * NS_PER_S
 HISTORY: Final = 100
 """Slices over which a late position is carried to now."""
 _KEEP: Final = 8
-FIX_TAU_S: Final = 10.0
-"""Positions are taken as if their errors lasted so long: light beside the lidar, firm where there is none."""
 LEAST_POSITION_SIGMA_M: Final = 0.02
 _HEADING_TOO: Final = np.deg2rad([1.0, 1.0, 5.0])
 """What the pose that it began from may be off by: as in the causal method."""
@@ -143,7 +150,8 @@ class Estimator:
         self._utc_offset_ns = 0
         self._utc_settled = False
         self._start_sigma = np.zeros(3)
-        self._history: deque[tuple[int, Array]] = deque(maxlen=HISTORY)
+        self._history: deque[tuple[int, Array, Array]] = deque(maxlen=HISTORY)
+        self._next_attitude_ns = 0
         self._last_fix_ns = -(1 << 62)
         self._far = 0
         self._next_try_s = self._next_poll_s = 0.0
@@ -215,6 +223,7 @@ class Estimator:
             return
         self._take_inertial(boot, self.tie)
         if self._tracker is not None and self._tracker.odometry is not None:
+            self._take_attitude(boot, self.tie)
             self._take_fixes(boot, self.tie)
 
     def _take_inertial(self, boot: Boot, tie: Tie) -> None:
@@ -398,7 +407,7 @@ class Estimator:
         path = self._last_path(track)
         quat = path.quat[-1]
         mat = frames.mat_from_quat(quat[None])[0] @ self._mat.T
-        self._history.append((end_ns, self._antenna_m()))
+        self._history.append((end_ns, self._antenna_m(), quat.copy()))
         sigma = track.sigma[-1]
         return Place(
             end_ns, end_ns + self._utc_offset_ns, state.position_m - mat @ self._lever, frames.quat_from_mat(mat[None])[0],
@@ -459,11 +468,11 @@ class Estimator:
         tracker = self._tracker
         if tracker is None or tracker.odometry is None or not self._history:
             return
-        stamps = np.array([t for t, _ in self._history], np.int64)
+        stamps = np.array([t for t, _, _ in self._history], np.int64)
         if time_ns < stamps[0] - SLICE_NS:
             self.figures.old_fixes += 1
             return
-        then = np.array([p for _, p in self._history])
+        then = np.array([p for _, p, _ in self._history])
         state = tracker.odometry.state
         was = np.array([np.interp(time_ns, stamps, axis) for axis in then.T])
         if time_ns > stamps[-1]:
@@ -476,6 +485,27 @@ class Estimator:
         )
         if self._far >= LOST_FIXES:
             self._restart()
+
+    def _take_attitude(self, boot: Boot, tie: Tie) -> None:
+        """The autopilot's newest attitude, once a second, turned on by what the path has turned since its time."""
+        tracker = self._tracker
+        if tracker is None or tracker.odometry is None or not self._history or ins.attitude_source(boot) is None:
+            return
+        _, boot_ns, quat, _ = ins.attitudes(boot)
+        time_ns = int(tie.lidar_ns(boot_ns[-1:])[0])
+        stamps = np.array([t for t, _, _ in self._history], np.int64)
+        if time_ns < max(self._next_attitude_ns, int(stamps[0])):
+            return
+        self._next_attitude_ns = time_ns + ATTITUDE_EVERY_NS
+        # between two slices on a straight line: what is off is small beside the 3 deg that it is taken with
+        last = int(np.clip(np.searchsorted(stamps, time_ns), 1, len(stamps) - 1)) if len(stamps) > 1 else 0
+        before, after = (frames.mat_from_quat(self._history[i][2][None])[0] for i in (max(last - 1, 0), last))
+        share = np.clip((time_ns - stamps[max(last - 1, 0)]) / SLICE_NS, 0.0, 1.0)
+        turn = frames.quat_log(frames.quat_from_mat((before.T @ after)[None]))
+        then = before @ frames.mat_from_quat(frames.quat_exp(share * turn))[0]
+        now = frames.mat_from_quat(tracker.odometry.state.quat[None])[0]
+        measured = frames.mat_from_quat(quat[-1:])[0] @ self._mat @ then.T @ now
+        tracker.odometry.attitude_fix(frames.quat_from_mat(measured[None])[0], ATTITUDE_FIX_RAD)
 
     def _restart(self) -> None:
         """The odometry has lost its way: begin anew from the autopilot's pose, with a new map."""
