@@ -3,6 +3,8 @@
 packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass; and the sigma of each.
 """
 
+import functools
+import pathlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
@@ -70,13 +72,21 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     main = max(made, key=lambda run: len(run.path.quat))
     mount = main.mount(given.mount)
     warnings = [w for run in made for w in run.warnings()] + [str(reason) for reason in reasons]
+    trajectory = joined([run.trajectory(given, mount) if not run.is_blind() else own_part(start, run) for run in made])
     return Estimate(
-        joined([run.trajectory(given, mount) if not run.is_blind() else own_part(start, run) for run in made]),
+        trajectory,
         mount,
         main.SIGMA_SOURCE,
         report=main.report(given.mount),
         warning="; ".join(warnings),
+        products=(functools.partial(_draw, main, given, trajectory),),
     )
+
+
+def _draw(run: "Run | CausalRun", given: Given, trajectory: Trajectory, folder: pathlib.Path) -> None:
+    from groundproc.products.adjustment_plot import draw_adjustment, sheet_of
+
+    draw_adjustment(folder / "adjustment.png", sheet_of(run, given, trajectory))
 
 
 @dataclass(slots=True)
@@ -227,7 +237,8 @@ def of_ins(
 
 
 _UNITS: Final = {
-    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2", "lever": "_m", "compass": "_deg",
+    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2", "accel_scale": "", "lever": "_m",
+    "compass": "_deg",
 }  # fmt: skip
 
 
@@ -314,8 +325,18 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
     return CausalRun(track.causal_path(motion), track, motion, positions.sigma_m[0])
 
 
-def adjust_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory, progress: Progress) -> Run:
-    """Adjust one run of the lidar's clock, window by window as the odometry goes on: the memory is that of a window."""
+def adjust_run(
+    given: Given,
+    legs: Sequence[Leg],
+    number: int,
+    start: Trajectory,
+    progress: Progress,
+    exact: tuple[str, ...] = (),
+) -> Run:
+    """Adjust one run of the lidar's clock, window by window as the odometry goes on: the memory is that of a window.
+
+    `exact` names globals whose covariance is wanted exactly.
+    """
     motion, own, other = base_motion(given, max(legs, key=lambda leg: leg.sync.samples), given.flight.runs[number])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     sources = Sources(
@@ -324,6 +345,7 @@ def adjust_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
         [attitude for leg in legs if (attitude := attitude_track(leg)) is not None],
         mat,
         lever,
+        exact,
     )
     tracker = Tracker(
         motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],

@@ -45,12 +45,12 @@ DRAWS: Final = 12
 
 PRIORS: Final[dict[str, float]] = {
     "lidar.bias": np.deg2rad(50.0), "lidar.scale": 0.01, "lidar.turn": np.deg2rad(0.3), "lidar.accel_bias": 0.5,
-    "lidar.lever": 0.15,
-    "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5, "ins.lever": 0.05,
-    "ins.delay": 0.01,
+    "lidar.accel_scale": 0.01, "lidar.lever": 0.15,
+    "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5,
+    "ins.accel_scale": 0.01, "ins.lever": 0.05, "ins.delay": 0.01,
 }  # fmt: skip
-"""What is known before, one sigma: gyro bias [rad/s], scale, misalignment against the lidar's optics [rad], accelerometer bias [m/s^2], place
-against the nominal one [m], delay beyond the synchronisation's [s]."""
+"""What is known before, one sigma: gyro bias [rad/s], scale, misalignment against the lidar's optics [rad], bias [m/s^2] and scale of
+the accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s]."""
 COMPASS_PRIOR: Final = np.deg2rad([5.0, 10.0, 10.0, 4.0, 4.0])
 
 
@@ -108,7 +108,7 @@ class Batch:
         for unit in self.units:
             names = ["bias", "scale", "turn"]
             if unit.force_known.any():
-                names += ["accel_bias", "lever"]
+                names += ["accel_bias", "accel_scale", "lever"]
             if unit.name == "ins":
                 names.append("delay")
             for name in names:
@@ -245,7 +245,7 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
     """A unit with nothing estimated yet but its gyro's bias."""
     values = {
         "bias": bias.copy(), "scale": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1), "accel_bias": np.zeros(3),
-        "lever": lever.copy(),
+        "accel_scale": np.zeros(3), "lever": lever.copy(),
     }  # fmt: skip
     none = np.zeros((0, 3))
     unit = Unit(

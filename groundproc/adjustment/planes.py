@@ -182,8 +182,8 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     weight, residual = np.empty(n), np.empty(n)
     inverse = np.empty((len(ids), 6))
     _linearise(
-        starts, kept, world, rotation, clusters.xyz_m, clusters.scatter_m2, clusters.count, normals[ids], means[ids], voxel_m, cut, jacobian, plane, weight,
-        residual, inverse,
+        starts, kept, world, rotation, clusters.xyz_m, clusters.scatter_m2, clusters.count, normals[ids], means[ids],
+        voxel_m, cut, jacobian, plane, weight, residual, inverse,
     )  # fmt: skip
     rows = Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
     _drop_unobserved(rows, rotation[kept], clusters.xyz_m[kept])

@@ -25,6 +25,10 @@ OVERLAP: Final = 200
 MISALIGNMENT_RAD: Final = np.deg2rad(0.2)
 """How far the axes of a cheap gyro are from those of its board (cross-axis sensitivity of its class, one sigma): the boresight is found
 through the gyro, and no flight tells the two apart."""
+LEVER_FLOOR_M: Final = 0.003
+"""The same for the lever arm, which is found through accelerometers whose axes are no better."""
+UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
+"""What the residuals do not show, by the global that it is in."""
 
 
 @dataclass(slots=True)
@@ -38,6 +42,8 @@ class Sources:
     positions, attitudes
     mat_ins_lidar, lever_m : ndarray
         Nominal mount.
+    exact : tuple of str
+        Globals whose covariance is wanted exactly.
     """
 
     units: Mapping[str, ImuTrack]
@@ -45,6 +51,7 @@ class Sources:
     attitudes: Sequence[Attitudes]
     mat_ins_lidar: Array
     lever_m: Array
+    exact: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -64,6 +71,8 @@ class Window:
         At slice boundaries: east, north, up; roll, pitch, heading; of the ins frame.
     log : list of dict
         What each Gauss-Newton step said.
+    covariance : ndarray or None
+        Of the globals asked for exactly, without what a gyro's axes may differ from its board's.
     """
 
     first: int
@@ -74,6 +83,7 @@ class Window:
     sigma_position_m: Array
     sigma_attitude_rad: Array
     log: list[dict[str, float]]
+    covariance: Array | None = None
 
 
 def adjust_window(
@@ -118,9 +128,9 @@ def adjust_window(
         old = before[-1]
         position = np.hypot(position, old.sigma_position_m[old.own])
         attitude = np.hypot(attitude, old.sigma_attitude_rad[old.own])
-    return Window(
-        first, last, last - first, batch.path, _values(batch, posterior, draws), position, attitude, batch.log
-    )
+    values = _values(batch, posterior, draws)
+    exact = posterior.covariance(sources.exact) if sources.exact and set(sources.exact) <= set(values) else None
+    return Window(first, last, last - first, batch.path, values, position, attitude, batch.log, exact)
 
 
 def _laid_on(path: Path, tie: Tie) -> Path:
@@ -140,8 +150,7 @@ def _values(batch: Batch, posterior: Posterior, draws: Array) -> dict[str, tuple
         if unit == "world":
             continue
         sigma = np.sqrt(np.mean(np.square(draws[:, where]), axis=0))
-        if name == "ins.turn":
-            sigma = np.hypot(sigma, MISALIGNMENT_RAD)
+        sigma = np.hypot(sigma, UNSEEN.get(name, 0.0))
         value = batch.compass if name == "compass" else next(u for u in batch.units if u.name == unit).values[key]
         found[name] = (value, sigma)
     return found
