@@ -50,6 +50,8 @@ def process(
     """
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)  # a wrong code is said before the work, not after
+    if poses is None:
+        methods.check(survey)
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder))
         readers = [stack.enter_context(LogReader(path)) for path in logs]
@@ -60,7 +62,7 @@ def process(
         if poses is None:
             made = methods.estimate(gather(readers, flight, timeline, mount, survey), progress)
         else:
-            made = Estimate(read_trajectory(poses), mount, f"as {poses} has them")
+            made = Estimate(read_trajectory(poses), mount, f"as {poses} has them", method="outside")
         trajectory = made.trajectory
         frame = trajectory.frame
         code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)

@@ -57,7 +57,7 @@ def describe(
             "unknown_frames": flight.unknown,
         },
         "trajectory": {
-            "method": survey.method,
+            "method": made.method,
             "start": utc_text(int(trajectory.time_ns[0])),
             "end": utc_text(int(trajectory.time_ns[-1])),
             "knots": len(trajectory),
@@ -65,9 +65,10 @@ def describe(
             "gaps_s": float(seconds[~trajectory.covered[:-1]].sum()),
             "median_sigma_m": np.median(trajectory.sigma_position_m, axis=0).tolist(),
             "sigma_source": made.sigma_source,
+            "note": made.note,
             "warning": made.warning,
         },
-        **({survey.method: made.report} if made.report else {}),
+        **({made.method: made.report} if made.report else {}),
         "lidar": {
             "packets": tally.packets,
             "packets_outside_every_leg": tally.packets_without_leg,

@@ -1,10 +1,13 @@
 """survey.yaml: what a user chooses about a survey, with what is taken where he does not."""
 
 from dataclasses import dataclass
+from typing import Final
 
 from flightlog.config import option
 from flightlog.mount import Mount
 from groundproc.calibration.options import DynamicOptions
+
+METHODS: Final = ("best", "adjusted", "filtered", "dynamic", "ins")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +28,11 @@ class Survey:
         "for height: ellipsoid where the autopilot does not state both heights: the geoid's height above the ellipsoid "
         "there [m], or a grid file that PROJ reads (.gtx, .tif)",
     )
-    method: str = option("ins", "how the trajectory is made", choices=("ins", "dynamic", "filtered", "adjusted"))
+    method: str = option(
+        "best",
+        "how the trajectory is made; best: adjusted, or where the log does not hold what that needs, filtered or ins, and it says so",
+        choices=METHODS,
+    )
     causal: bool = option(False, "adjusted: use nothing of the future, as in flight")
     dynamic: DynamicOptions = option(DynamicOptions, "method dynamic: trims once per revolution of the scanner")
     compass: str | None = option(
@@ -39,7 +46,7 @@ class Survey:
     )
     pose_grid_ms: float | None = option(
         None,
-        "one pose for so many milliseconds, as the source did with 10; null: a pose for every firing",
+        "method ins: one pose for so many milliseconds, as the source did with 10; null: a pose for every firing",
         minimum=1,
         maximum=1000,
     )

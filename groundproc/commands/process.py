@@ -20,7 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
     parser.add_argument(
-        "--method", choices=("ins", "dynamic", "filtered", "adjusted"), help="how the trajectory is made"
+        "--method",
+        choices=("best", "adjusted", "filtered", "dynamic", "ins"),
+        help="how the trajectory is made; default: best, which is adjusted, or filtered or ins where the log does not hold what that needs",
     )
     parser.add_argument(
         "--causal", action="store_true", default=None, help="adjusted: use nothing of the future, as in flight"
@@ -36,7 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--geoid", metavar="N", help="geoid above the ellipsoid: a number [m] or a PROJ grid file")
     parser.add_argument(
-        "--pose-grid", metavar="MS", help="one pose for so long, such as 10ms; default: one for every firing"
+        "--pose-grid",
+        metavar="MS",
+        help="method ins: one pose for so long, such as 10ms; default: one for every firing",
     )
     parser.add_argument("--sync", choices=("auto", "gyro", "host"), help="how the clocks are tied; default: auto")
     parser.add_argument("--fov", metavar="A-B", help="azimuths kept, clockwise, in degrees, or all; default: 255-105")
@@ -107,7 +111,9 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
     east, north, up = track["median_sigma_m"]
     lines = [
         f"{points['written']:,} points in EPSG:{crs['epsg']} ({crs['name']}), heights {height['meaning']}",
-        f"trajectory {track['covered_s']:.1f} s from {track['start']}, sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)",
+        f"trajectory by {track['method']}: {track['covered_s']:.1f} s from {track['start']}, "
+        f"sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)"
+        + (f"; {track['note']}" if track["note"] else ""),
         f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
         + (f"; {sync['note']}" if sync["note"] else ""),
         f"mount from {quality['mount']['source']}",

@@ -72,6 +72,10 @@ class Estimate:
         One sentence where the self-check found something wrong; empty where all is well.
     products : tuple of callable
         Each is called with the folder of the products and writes files of the method's own into it.
+    method : str
+        Name of the method that made it.
+    note : str
+        Why it is this method and not a better one; empty where it is the one that was asked for.
     """
 
     trajectory: Trajectory
@@ -81,6 +85,8 @@ class Estimate:
     report: dict[str, Any] = field(default_factory=dict)
     warning: str = ""
     products: tuple[Callable[[Path], None], ...] = ()
+    method: str = ""
+    note: str = ""
 
 
 def gather(

@@ -1,32 +1,68 @@
 """The methods by their names on the command line."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from flightlog.errors import LogError, UsageError
+from flightlog.errors import CoverageError, LogError, UsageError
 from groundproc.adjustment import adjusted
 from groundproc.calibration import dynamic
+from groundproc.survey import Survey
 from groundproc.trajectory import filtered, ins
 from groundproc.trajectory.method import Estimate, Given, Progress
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 
 def estimate(given: Given, progress: Progress) -> Estimate:
-    """Make the trajectory with the method that the survey chose.
+    """Make the trajectory with the method that the survey chose, or with the best that the log allows.
 
     Raises
     ------
     UsageError
-        Positions are given that the method would not look at.
+        An option is given that the method would not look at.
+    SwathError
+        The log does not hold what the method needs.
     """
-    survey = given.survey
-    if survey.positions is not None and survey.method != "filtered":
-        raise UsageError(
-            f"positions: {survey.positions} given, but only method filtered uses them, not {survey.method}"
-        )
-    return METHODS[given.survey.method](given, progress)
+    check(given.survey)
+    names = candidates(given.survey)
+    reasons: list[str] = []
+    for name in names:
+        try:
+            made = METHODS[name](given, progress)
+        except (LogError, CoverageError) as error:
+            if name == names[-1]:
+                raise
+            reasons.append(f"not {name}, because {str(error).removeprefix(f'{name}: ')}")
+            continue
+        return replace(made, method=name, note="; ".join(reasons))
+    raise AssertionError(f"no method for {given.survey.method}")
+
+
+def candidates(survey: Survey) -> tuple[str, ...]:
+    """Methods to try, the best first.
+
+    `best` goes down only as far as the other options allow: only the adjustment is causal, only the filter takes positions in.
+    """
+    if survey.method != "best":
+        return (survey.method,)
+    if survey.positions is not None:
+        return ("filtered",)
+    return ("adjusted",) if survey.causal else ("adjusted", "filtered", "ins")
+
+
+def check(survey: Survey) -> None:
+    """Refuse options that the chosen method would not look at.
+
+    Raises
+    ------
+    UsageError
+    """
+    for name, method in OPTIONS_OF.items():
+        value = getattr(survey, name)
+        if value not in (None, False) and method not in candidates(survey)[:1]:
+            raise UsageError(f"{name}: {value} given, but only method {method} uses it, not {survey.method}")
 
 
 def ins_estimate(given: Given, progress: Progress) -> Estimate:
@@ -69,6 +105,9 @@ def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
     """The source's dynamic calibration of another method's trajectory."""
     return dynamic.dynamic_estimate(given, progress, METHODS[given.survey.dynamic.start])
 
+
+OPTIONS_OF: Final = {"positions": "filtered", "compass": "dynamic", "causal": "adjusted", "pose_grid_ms": "ins"}
+"""Options of the survey that one method alone looks at."""
 
 METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
     "ins": ins_estimate,

@@ -47,8 +47,9 @@ class Processed:
         return np.asarray(np.genfromtxt(self.folder / "trajectory.csv", delimiter=",", names=True, dtype=None))
 
 
-def process(folder: Path, *words: Any) -> Processed:
-    assert main(["process", *(str(word) for word in words), "-o", str(folder)]) == 0
+def process(folder: Path, *words: Any, method: str = "ins") -> Processed:
+    """Products by the autopilot's own solution where nothing else is said: these tests are about the chain."""
+    assert main(["process", *(str(word) for word in words), "--method", method, "-o", str(folder)]) == 0
     assert {path.name for path in folder.iterdir()} == PRODUCTS
     return Processed(folder)
 
@@ -70,7 +71,7 @@ def rewritten(source: Path, target: Path, keep: Callable[[Any], bool]) -> Path:
 
 @pytest.fixture(scope="module")
 def flown(gps_flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Processed:
-    """The flight with all errors, processed by the defaults."""
+    """The flight with all errors, and the autopilot's own solution."""
     return process(tmp_path_factory.mktemp("flown"), gps_flight.log)
 
 
@@ -122,7 +123,7 @@ def test_with_true_poses_the_cloud_lies_on_the_true_surfaces(gps_flight: Any, tm
     0.005 deg (0.004 of encoder noise, 0.01 of step): 25 m x 0.09 mrad x tan 45 = 2.2 mm. Together 15.2; 15.75 are allowed. Left out
     are shots whose 2.8 mrad may touch the foot, the top or the ends of the wall.
     """
-    made = process(tmp_path / "out", gps_flight.log, "--trajectory", gps_flight.poses_file)
+    made = process(tmp_path / "out", gps_flight.log, "--trajectory", gps_flight.poses_file, method="best")
     cloud = made.cloud
     unix_s = np.asarray(cloud.gps_time) + 1e9 - LEAP_S + 315_964_800 - gps_flight.poses["utc_ns"][0] * 1e-9
     points, lidar = local_m(points_of(cloud), 32633, gps_flight.truth), lidar_m(gps_flight.poses, unix_s)
@@ -449,6 +450,59 @@ def test_a_log_that_a_power_cut_ended_is_processed_as_far_as_it_goes(gps_flight:
     assert (made.trajectory["utc_ns"][-1] - made.trajectory["utc_ns"][0]) * 1e-9 > 10.0
 
 
+# Which method ----------------------------------------------------------------------------------------------------------
+
+
+def without_imu(source: Path, target: Path) -> Path:
+    """A copy of a log without inertial data: neither the lidar's nor the autopilot's, whose attitude comes three times as rarely."""
+    seen = 0
+
+    def kept(data: bytes) -> bool:
+        nonlocal seen
+        name = dialect.MAVLink(None).decode(bytearray(data)).get_type()
+        seen += name == "ATTITUDE"
+        return name not in ("RAW_IMU", "SCALED_IMU", "HIGHRES_IMU") and (name != "ATTITUDE" or seen % 3 == 0)
+
+    with LogReader(source) as reader, target.open("wb") as stream:
+        writer = LogWriter(stream, metadata={}, attachments=dict(reader.attachments))
+        for message in reader.messages():
+            data = bytes(message.data)
+            if message.topic == "/velodyne_position":
+                continue
+            if "mavlink" in message.topic:
+                chunks = [(t, chunk) for t, chunk in records.decode_raw(data) if kept(bytes(chunk))]
+                data = records.encode_raw(message.log_time_ns, chunks, "ins")
+            writer.write(message.topic, message.log_time_ns, data)
+        writer.finish()
+    return target
+
+
+def test_the_best_method_is_the_adjustment(judged_flight: Any, tmp_path: Path) -> None:
+    made = process(tmp_path / "out", judged_flight.log, method="best")
+    assert made.quality["trajectory"]["method"] == "adjusted"
+    assert made.quality["trajectory"]["note"] == ""
+    assert made.quality["config"]["method"] == "best"
+    assert "estimated" in made.quality["adjusted"]
+
+
+def test_without_a_gyro_the_best_is_less_and_it_says_so(
+    gps_flight: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = without_imu(gps_flight.log, tmp_path / "a.mcap")
+    made = process(tmp_path / "out", log, "--sync", "host", method="best")
+    track = made.quality["trajectory"]
+    assert track["method"] in ("filtered", "ins")
+    assert "not adjusted, because no gyro of 20 Hz" in track["note"]
+    assert track["note"] in capsys.readouterr().out
+    # it is what that method makes when asked for, and nothing in between
+    asked = process(tmp_path / "asked", log, "--sync", "host", method=track["method"])
+    assert asked.quality["trajectory"]["note"] == ""
+    np.testing.assert_array_equal(points_of(asked.cloud), points_of(made.cloud))
+    # who asks for the adjustment does not get something else
+    assert "no gyro of 20 Hz" in refused(capsys, tmp_path / "not", log, "--sync", "host", "--method", "adjusted")
+    assert "no gyro of 20 Hz" in refused(capsys, tmp_path / "not", log, "--sync", "host", "--causal")
+
+
 # What is wrong is said in one sentence ----------------------------------------------------------------------------------
 
 
@@ -509,6 +563,10 @@ def test_a_folder_that_cannot_be_written_is_refused(
         (["--height", "ellipsoid"], 1, "--geoid"),
         (["--height", "ellipsoid", "--geoid", "nowhere.gtx"], 1, "nowhere.gtx"),
         (["--pose-grid", "10s"], 2, "10s"),
+        (["--pose-grid", "10ms"], 2, "only method ins"),
+        (["--method", "ins", "--causal"], 2, "only method adjusted"),
+        (["--method", "adjusted", "--positions", "nowhere.pos"], 2, "only method filtered"),
+        (["--compass", "nowhere.yaml"], 2, "only method dynamic"),
         (["--fov", "wide"], 2, "wide"),
         (["--sync", "gyro"], 1, "gyro"),
         (["--trajectory", "nowhere.csv"], 1, "nowhere.csv"),
