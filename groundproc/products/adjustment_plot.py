@@ -26,13 +26,13 @@ Array = npt.NDArray[np.float64]
 BLIND_BELOW: Final = 50
 """Matched clusters of a tenth of a second below which the lidar has next to no planes."""
 AXES_OF: Final = {
-    "bias": "x y z", "scale": "x y z", "turn": "x y z", "accel_bias": "x y z", "accel_scale": "x y z", "lever": "x y z",
-    "delay": "", "compass": "const sin cos sin2 cos2",
+    "bias": "x y z", "scale": "x y z", "turn": "x y z", "accel_bias": "x y z", "accel_scale": "x y z", "accel_turn": "x y z",
+    "lever": "x y z", "delay": "", "compass": "const sin cos sin2 cos2",
 }  # fmt: skip
 """What the numbers of an estimated parameter are of."""
 UNITS_OF: Final = {
-    "bias": "deg/s", "scale": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_scale": "%", "lever": "cm", "delay": "ms",
-    "compass": "deg",
+    "bias": "deg/s", "scale": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_scale": "%", "accel_turn": "deg",
+    "lever": "cm", "delay": "ms", "compass": "deg",
 }  # fmt: skip
 FACTORS: Final = {"scale": 100.0, "accel_scale": 100.0, "lever": 100.0, "delay": 1000.0}
 """From the unit of quality.json to that of the table, where they differ."""
@@ -256,7 +256,11 @@ def _table(estimated: dict[str, Any]) -> list[tuple[list[str], bool]]:
         last = key.rsplit(".", 1)[-1]
         base = next((n for n in sorted(UNITS_OF, key=len, reverse=True) if last == n or last.startswith(n + "_")), last)
         source = "autopilot" if key.startswith("ins.") else ("lidar's IMU" if key.startswith("lidar.") else "")
-        name = {"turn": "boresight" if key.startswith("ins.") else "misalignment", "lever": "place"}.get(base, base)
+        name = {
+            "turn": "boresight" if key.startswith("ins.") else "misalignment",
+            "lever": "place",
+            "accel_turn": "accel misalignment",
+        }.get(base, base)
         factor = FACTORS.get(base, 1.0)
         axes = AXES_OF.get(base, "").split() or [""] * len(entry["value"])
         for axis, value, sigma, prior, held in zip(
