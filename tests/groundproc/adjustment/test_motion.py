@@ -42,7 +42,7 @@ def test_means_over_steps_sum_to_the_integral(rate_hz: float, share: float) -> N
     seconds = np.arange(-0.5, 4.5, 1 / rate_hz)
     values, known = on_grid(np.rint(seconds * 1e9).astype(np.int64), swing(seconds), 0, 800)
     assert known.all()
-    edges = np.arange(801) * STEP_S
+    edges = np.linspace(0.0, 800 * STEP_S, 801)
     off = np.cumsum(values, axis=0) * STEP_S - (swung(edges[1:]) - swung(edges[:1]))
     # of an integral that swings by 1 / w
     assert np.abs(off[:, 0]).max() < 2.0 * share / (2 * np.pi * 2) * 2 + 1e-6
