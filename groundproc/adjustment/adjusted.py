@@ -18,12 +18,13 @@ from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.adjustment.anchors import Attitudes, Positions
 from groundproc.adjustment.batch import COMPASS_PRIOR, PRIORS, turned
+from groundproc.adjustment.beginning import BEGINNING, redo_beginning
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
-from groundproc.adjustment.scans import STEP_NS, STEPS, slices
+from groundproc.adjustment.scans import STEP_NS, STEPS, Slice, slices
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track, Tracker, grid_ns, tracked
-from groundproc.adjustment.windows import OVERLAP, WINDOW, Sources, Window, adjust_window, joined_path
+from groundproc.adjustment.windows import OVERLAP, UNSEEN, WINDOW, Sources, Window, adjust_window, joined_path
 from groundproc.autopilot import Boot
 from groundproc.geodesy import LocalFrame
 from groundproc.timeline import Leg
@@ -117,7 +118,8 @@ class Run:
         for name in self.windows[0].values:
             values = np.array([window.values[name][0] for window in self.windows])
             weights = np.array([window.values[name][1] for window in self.windows]) ** -2.0
-            found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), weights.sum(axis=0) ** -0.5)
+            sigma = np.hypot(weights.sum(axis=0) ** -0.5, UNSEEN.get(name, 0.0))
+            found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), sigma)
         return found
 
     def mount(self, nominal: Mount) -> Mount:
@@ -151,6 +153,11 @@ class Run:
             found.append(
                 f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1; the cloud may be doubled"
             )
+        moved = max(window.log[-1]["moved_m"] for window in self.windows)
+        if moved > UNSETTLED_M:
+            found.append(
+                f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
+            )
         off = max(window.log[-1].get("position_rms", 0.0) for window in self.windows)
         if off > 4.0:
             found.append(
@@ -183,7 +190,7 @@ class Run:
         values: dict[str, Any] = {}
         for key, (value, sigma) in self.estimates().items():
             name = key.rsplit(".", 1)[-1]
-            scale = np.rad2deg(1.0) if name in ("bias", "turn", "compass") else 1.0
+            scale = np.rad2deg(1.0) if name in ("bias", "turn", "accel_turn", "compass") else 1.0
             prior = COMPASS_PRIOR if name == "compass" else np.full(len(value), PRIORS[key])
             values[key + _UNITS[name]] = {
                 "value": (value * scale).tolist(),
@@ -212,6 +219,10 @@ class Run:
         }
 
 
+UNSETTLED_M: Final = 0.03
+"""A last step larger than this is worth a warning."""
+
+
 def of_ins(
     path: Path, motion: Motion, frame: LocalFrame, mount: Mount, sigma_position_m: Array, sigma_attitude_rad: Array
 ) -> Trajectory:
@@ -237,7 +248,8 @@ def of_ins(
 
 
 _UNITS: Final = {
-    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2", "accel_scale": "", "lever": "_m",
+    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2",
+    "accel_turn": "_deg", "lever": "_m",
     "compass": "_deg",
 }  # fmt: skip
 
@@ -353,13 +365,22 @@ def adjust_run(
     )  # fmt: skip
     windows: list[Window] = []
     begin = 0
+    early: list[Slice] = []
     for piece in slices(given, motion.start_ns, progress):
         tracker.feed(piece)
-        if tracker.track is not None and len(tracker.track) - begin >= WINDOW:
+        if tracker.track is None:
+            continue
+        if len(tracker.track) <= BEGINNING:
+            early.append(piece)
+        if len(tracker.track) - begin >= WINDOW:
+            if not windows and tracker.odometry is not None:
+                redo_beginning(tracker.track, motion, early, tracker.odometry.state)
             windows.append(adjust_window(tracker.track, motion, sources, begin, len(tracker.track), windows))
             begin = len(tracker.track) - OVERLAP
             tracker.track.forget(begin)
     track = tracked(tracker)
+    if not windows and tracker.odometry is not None:
+        redo_beginning(track, motion, early, tracker.odometry.state)
     if not windows or len(track) - begin > OVERLAP:
         windows.append(adjust_window(track, motion, sources, begin, len(track), windows))
     return Run(windows, joined_path(windows), track, motion)

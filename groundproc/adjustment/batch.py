@@ -37,6 +37,9 @@ Array = npt.NDArray[np.float64]
 
 ROUNDS: Final = ((1.0, False), (0.5, False), (0.5, True), (0.5, True))
 """Edge of the voxels [m], and whether outliers are cut, of each Gauss-Newton step."""
+MORE_ROUNDS: Final = 5
+SETTLED_M: Final = 0.003
+"""The last step is taken again, so often at most, until the path's shape moves less than this, RMS."""
 DEFLATION: Final = 4.0
 """The lidar's information is divided by this: errors of neighbouring clusters are not independent. Checked by the share of errors within
 two sigmas (tests)."""
@@ -45,12 +48,12 @@ DRAWS: Final = 12
 
 PRIORS: Final[dict[str, float]] = {
     "lidar.bias": np.deg2rad(50.0), "lidar.scale": 0.01, "lidar.turn": np.deg2rad(0.3), "lidar.accel_bias": 0.5,
-    "lidar.accel_scale": 0.01, "lidar.lever": 0.15,
+    "lidar.accel_turn": np.deg2rad(0.5), "lidar.lever": 0.15,
     "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5,
-    "ins.accel_scale": 0.01, "ins.lever": 0.05, "ins.delay": 0.01,
+    "ins.accel_turn": np.deg2rad(0.5), "ins.lever": 0.05, "ins.delay": 0.01,
 }  # fmt: skip
-"""What is known before, one sigma: gyro bias [rad/s], scale, misalignment against the lidar's optics [rad], bias [m/s^2] and scale of
-the accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s]."""
+"""What is known before, one sigma: gyro bias [rad/s], scale, misalignment against the lidar's optics [rad], bias [m/s^2] and
+misalignment against the gyro of the accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s]."""
 COMPASS_PRIOR: Final = np.deg2rad([5.0, 10.0, 10.0, 4.0, 4.0])
 
 
@@ -93,10 +96,12 @@ class Batch:
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
         """All Gauss-Newton steps, and the posterior of the last."""
-        last: Posterior | None = None
         for number, (voxel_m, cut) in enumerate(rounds):
             last = self.step(voxel_m, cut, weigh=number == 1)
-        assert last is not None
+        for _ in range(MORE_ROUNDS):
+            if self.log[-1]["moved_m"] < SETTLED_M:
+                break
+            last = self.step(*rounds[-1], weigh=False)
         return last
 
     def unknowns(self) -> Unknowns:
@@ -108,7 +113,7 @@ class Batch:
         for unit in self.units:
             names = ["bias", "scale", "turn"]
             if unit.force_known.any():
-                names += ["accel_bias", "accel_scale", "lever"]
+                names += ["accel_bias", "accel_turn", "lever"]
             if unit.name == "ins":
                 names.append("delay")
             for name in names:
@@ -132,11 +137,13 @@ class Batch:
         self.log.append(
             {
                 "voxel_m": voxel_m, "rows": len(rows), "used": used, "steps": steps, "chi_square": cost / max(used, 1),
-                "moved_m": float(np.sqrt(np.mean(np.square(x[: unknowns.path_size].reshape(-1, 6)[:, 3:])) * 3.0)),
             }
             | {f"{f.name}_rms": f.rms() for f in factors}
         )  # fmt: skip
+        before = self.path.position_m[::STEPS]
         self.take(unknowns, x)
+        moved = self.path.position_m[::STEPS] - before
+        self.log[-1]["moved_m"] = float(np.sqrt(np.square(moved - moved.mean(axis=0)).sum(axis=1).mean()))
         return Posterior(linear, unknowns, factors)
 
     def factors(self, unknowns: Unknowns, weigh: bool) -> list[Factor]:
@@ -245,7 +252,7 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
     """A unit with nothing estimated yet but its gyro's bias."""
     values = {
         "bias": bias.copy(), "scale": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1), "accel_bias": np.zeros(3),
-        "accel_scale": np.zeros(3), "lever": lever.copy(),
+        "accel_turn": np.zeros(3), "lever": lever.copy(),
     }  # fmt: skip
     none = np.zeros((0, 3))
     unit = Unit(

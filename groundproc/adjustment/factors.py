@@ -153,7 +153,8 @@ class Unit:
         As measured, in the sensor frame by the nominal mount.
     known, force_known : ndarray of bool, shape (n STEPS,)
     values : dict of str to ndarray
-        bias [rad/s], scale, turn [rad], delay [s], accel_bias [m/s^2], accel_scale, lever [m]: what has been taken off so far.
+        bias [rad/s], scale, turn [rad], delay [s], accel_bias [m/s^2], accel_turn [rad], lever [m]: what has
+        been taken off so far.
     sigma_turn_rad, sigma_force_m_s2 : float
         Noise of an increment over a slice; of the mean force about a knot.
     """
@@ -209,8 +210,8 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     """Second differences of position over two slices against the force between: hat(t) (R f + g) integrated, free of velocities."""
     mats = frames.mat_from_quat(path.quat)
     middle = 0.5 * (mats[:-1] + mats[1:])
-    turn = frames.mat_from_quat(frames.quat_exp(unit.values["turn"][None]))[0]
-    force = (unit.force_m_s2 - unit.values["accel_bias"]) / (1.0 + unit.values["accel_scale"]) @ turn.T
+    turn = frames.mat_from_quat(frames.quat_exp((unit.values["turn"] + unit.values["accel_turn"])[None]))[0]
+    force = (unit.force_m_s2 - unit.values["accel_bias"]) @ turn.T
     felt = np.einsum("nij,nj->ni", middle, force).reshape(-1, STEPS, 3)
     rising, falling = _HAT[:STEPS], _HAT[STEPS:]
     up, down = np.einsum("k,nkj->nj", rising, felt), np.einsum("k,nkj->nj", falling, felt)
@@ -235,9 +236,8 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     builder.at_knots(row, knot + 1, 3, unit_mat)
     builder.at_knots(row, knot, 0, mean_mat @ cross(mean_force))
     builder.by(row, f"{unit.name}.accel_bias", mean_mat)
-    builder.by(row, f"{unit.name}.accel_scale", mean_mat * mean_force[:, None, :])
-    if f"{unit.name}.turn" in unknowns.names:
-        builder.by(row, f"{unit.name}.turn", mean_mat @ cross(mean_force))
+    for name in ("turn", "accel_turn"):
+        builder.by(row, f"{unit.name}.{name}", mean_mat @ cross(mean_force))
     builder.by(row, "world.turn", np.tile(-cross(GRAVITY[None])[0], (len(good), 1, 1)))
     if f"{unit.name}.lever" in unknowns.names:
         at = mats[::STEPS]

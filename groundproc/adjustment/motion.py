@@ -96,15 +96,25 @@ def ins_imu(boot: Boot, leg: Leg, mat_ins_lidar: Array) -> ImuTrack | None:
     tracks = [t for t in boot.gyros() if len(t.time_ns) > 10]
     if not tracks:
         return None
-    best = max(tracks, key=lambda track: track.rate_hz if track.rate_hz < 1e3 else 0.0)
+    forces = {name: unit for name, unit in INS_FORCES if _felt(boot, name)}
+    # one that also tells forces is worth more than one a little faster
+    with_forces = [track for track in tracks if track.name in forces and track.rate_hz >= LEAST_BASE_HZ]
+    best = max(with_forces or tracks, key=lambda track: track.rate_hz if track.rate_hz < 1e3 else 0.0)
     force = np.full_like(best.rate_rad_s, np.nan)
-    for name, unit in INS_FORCES:
-        if best.name == name:
-            frd = np.stack([boot.tables[name][f].astype(np.float64) for f in ("xacc", "yacc", "zacc")], axis=1) * unit
-            if np.ptp(frd) > 0.0:
-                force = frames.ins_from_frd(frd)
+    if best.name in forces:
+        force = frames.ins_from_frd(_force_frd(boot, best.name) * forces[best.name])
     rate, force = best.rate_rad_s @ mat_ins_lidar, force @ mat_ins_lidar
     return ImuTrack(best.name, leg.utc_from_boot(best.time_ns), rate, force, _noise(rate), _noise(force))
+
+
+def _force_frd(boot: Boot, name: str) -> Array:
+    """Readings of the accelerometer in a message, shape (n, 3)."""
+    return np.stack([boot.tables[name][field].astype(np.float64) for field in ("xacc", "yacc", "zacc")], axis=1)
+
+
+def _felt(boot: Boot, name: str) -> bool:
+    """Whether a message is there and its accelerometer says anything."""
+    return boot.has(name, 10) and bool(np.ptp(_force_frd(boot, name)) > 0.0)
 
 
 def _noise(samples: Array) -> float:
@@ -199,7 +209,11 @@ def base_motion(given: Given, leg: Leg, run: LidarRun) -> tuple[Motion, ImuTrack
         known = _filled(rate, known, *on_grid(other.time_ns, other.rate_rad_s, start_ns, steps))
     if len(forces) > 1:
         felt = _filled(force, felt, *on_grid(forces[1].time_ns, forces[1].force_m_s2, start_ns, steps))
-    motion = Motion(start_ns, rate, force, known & felt, base.rate_density(), forces[0].force_density(), base.name)
+    known &= felt
+    if known.any():  # a last step that is half known would leave the path's end without hold
+        end = int(np.flatnonzero(known)[-1]) + 1
+        rate, force, known = rate[:end], force[:end], known[:end]
+    motion = Motion(start_ns, rate, force, known, base.rate_density(), forces[0].force_density(), base.name)
     return motion, own, other
 
 

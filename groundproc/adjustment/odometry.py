@@ -16,8 +16,8 @@ from numba import njit
 from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.adjustment.motion import Motion
 from groundproc.adjustment.rotations import mat_of_quat, quat_difference, quat_turned
-from groundproc.adjustment.scans import STEP_NS, STEPS, Clusterer, Slice, voxel_key
-from groundproc.adjustment.voxels import FLATNESS, LEVEL, MEAN, NORMAL, TILT, PlaneMap, find
+from groundproc.adjustment.scans import CLUSTER_DTYPE, STEP_NS, STEPS, Clusterer, Slice, voxel_key
+from groundproc.adjustment.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, TILT, PlaneMap, find
 
 Array = npt.NDArray[np.float64]
 
@@ -124,6 +124,17 @@ class Odometry:
                 np.full(3, np.deg2rad(0.005) ** 2 * step), np.full(3, 0.002**2 * step), np.full(3, 1e-14),
             ]
         )  # fmt: skip
+
+    def change_voxels(self, voxel_m: float) -> None:
+        """Go on with voxels of another edge; the moments of the old ones go into the new."""
+        before, self.voxel_m = self.map, voxel_m
+        rows = before.voxels[: before.count]
+        clusters = np.zeros(before.count, CLUSTER_DTYPE)
+        clusters["count"], clusters["scatter"] = rows[:, COUNT], rows[:, SCATTER : SCATTER + 6]
+        self.map, self._cluster = PlaneMap(voxel_m), Clusterer(voxel_m)
+        for first in range(0, before.count, 10_000):
+            part = slice(first, first + 10_000)
+            self.map.insert(rows[part, MEAN : MEAN + 3].copy(), clusters[part], self.MOST)
 
     def propagate(self, to: int) -> tuple[Array, Array]:
         """Carry the state on to the end of slice `to`; poses on the grid over that slice, (STEPS + 1, 4) and (STEPS + 1, 3)."""

@@ -23,7 +23,10 @@ from groundproc.trajectory.trajectory import Trajectory
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-VOXEL_M: Final = 0.5
+VOXELS_M: Final = (0.5, 1.0, 2.0)
+"""Edges of the odometry's voxels; rings on the ground lie wider apart the higher one flies, and a voxel must see more than one."""
+WIDE_AT_M: Final = (28.0, 60.0)
+"""Median range from which on the second and the third are taken."""
 KEPT: Final = 1200
 """Clusters of a slice that are kept for the batch."""
 LOST_M: Final = 15.0
@@ -66,6 +69,8 @@ class Track:
     residual_m : list of float
     restarts : int
         How often it lost its way.
+    voxel_m : float
+        Edge of the odometry's voxels at last.
     """
 
     first: int
@@ -79,6 +84,7 @@ class Track:
     seen: list[int] = field(default_factory=list)
     residual_m: list[float] = field(default_factory=list)
     restarts: int = 0
+    voxel_m: float = VOXELS_M[0]
 
     def __len__(self) -> int:
         return len(self.clusters)
@@ -160,6 +166,7 @@ class Tracker:
         self.odometry: Odometry | None = None
         self.track: Track | None = None
         self._next_fix, self._far, self._next_attitude_ns = 0, 0, 0
+        self._range_m = 0.0
 
     def feed(self, piece: Slice) -> Step | None:
         """Take the next slice; None before the start, and where the inertial data have ended."""
@@ -167,8 +174,10 @@ class Tracker:
             state = self._state_at(piece.number)
             if state is None:
                 return None
-            self.odometry = Odometry(state, self.motion, piece.number, VOXEL_M)
-            self.track = Track(piece.number, [state.quat.copy()], [state.position_m.copy()])
+            self._range_m = _median_range(piece)
+            voxel_m = _edge(self._range_m)
+            self.odometry = Odometry(state, self.motion, piece.number, voxel_m)
+            self.track = Track(piece.number, [state.quat.copy()], [state.position_m.copy()], voxel_m=voxel_m)
         assert self.track is not None
         if piece.number < self.odometry.number or (piece.number + 1) * STEPS > len(self.motion):
             return None
@@ -177,11 +186,22 @@ class Tracker:
             self._take_attitude()
             self._take_fixes()
             self._note(None)
+        self._follow_range(piece)
         step = self.odometry.step(piece)
         self._take_attitude()
         self._take_fixes()
         self._note(step)
         return step
+
+    def _follow_range(self, piece: Slice) -> None:
+        """Wider voxels as the ranges grow, and narrower ones again; what the map holds is taken along."""
+        assert self.odometry is not None
+        assert self.track is not None
+        self._range_m += 0.05 * (_median_range(piece) - self._range_m)
+        voxel_m = _edge(self._range_m, self.odometry.voxel_m)
+        if voxel_m != self.odometry.voxel_m:
+            self.odometry.change_voxels(voxel_m)
+            self.track.voxel_m = voxel_m
 
     def _note(self, step: Step | None) -> None:
         track, state = self.track, self.odometry.state  # type: ignore[union-attr]
@@ -249,7 +269,7 @@ class Tracker:
         assert self.track is not None
         state = self._state_at(self.odometry.number)
         if state is not None:
-            self.odometry.state, self.odometry.map = state, PlaneMap(VOXEL_M)
+            self.odometry.state, self.odometry.map = state, PlaneMap(self.odometry.voxel_m)
             self.track.restarts += 1
             self._far = 0
 
@@ -281,6 +301,19 @@ class Tracker:
         quat = frames.quat_from_mat((mats[0] @ self._mat)[None])[0]
         gravity = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
         return State(quat, places[0].copy(), velocity, bias.copy(), np.zeros(3), gravity, np.diag(sigma**2))
+
+
+def _median_range(piece: Slice) -> float:
+    """Median range of a slice's returns [m]; a sixteenth of them will do."""
+    return float(np.median(np.linalg.norm(piece.xyz_m[::16], axis=1))) if len(piece.xyz_m) else 0.0
+
+
+def _edge(range_m: float, now_m: float = 0.0) -> float:
+    """Edge of the voxels for a median range; one in use is kept until the range is 15 % past the border."""
+    for edge, border in zip(VOXELS_M, (*WIDE_AT_M, np.inf), strict=True):
+        if range_m < border * (1.0 if now_m == 0.0 else (1.15 if now_m <= edge else 0.85)):
+            return edge
+    return VOXELS_M[-1]
 
 
 def tracked(tracker: Tracker) -> Track:

@@ -25,6 +25,9 @@ OVERLAP: Final = 200
 MISALIGNMENT_RAD: Final = np.deg2rad(0.2)
 """How far the axes of a cheap gyro are from those of its board (cross-axis sensitivity of its class, one sigma): the boresight is found
 through the gyro, and no flight tells the two apart."""
+RELATIVE: Final = 2.0
+"""What the path's own draws are stretched by: errors of the lidar along the flight are correlated over more than one slice. Found with
+simulated flights, where the draws alone were one to two times too small in position and two to four times in attitude."""
 LEVER_FLOOR_M: Final = 0.003
 """The same for the lever arm, which is found through accelerometers whose axes are no better."""
 UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
@@ -150,7 +153,6 @@ def _values(batch: Batch, posterior: Posterior, draws: Array) -> dict[str, tuple
         if unit == "world":
             continue
         sigma = np.sqrt(np.mean(np.square(draws[:, where]), axis=0))
-        sigma = np.hypot(sigma, UNSEEN.get(name, 0.0))
         value = batch.compass if name == "compass" else next(u for u in batch.units if u.name == unit).values[key]
         found[name] = (value, sigma)
     return found
@@ -170,7 +172,7 @@ def _sigmas(
     ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
     for draw in draws:
         part = {name: draw[where] for name, where in unknowns.names.items()}
-        spline = draw[: unknowns.path_size].reshape(-1, 6)
+        spline = RELATIVE * draw[: unknowns.path_size].reshape(-1, 6)
         at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
         in_body = at[:, :3] + part.get("ins.turn", np.zeros(3))
         turn = np.einsum("nij,nj->ni", mats, in_body) + part["world.turn"]
