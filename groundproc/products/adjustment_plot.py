@@ -56,7 +56,7 @@ class Sheet:
     sigma_position_m, sigma_attitude_rad : ndarray, shape (m, 3)
         Of the trajectory: east, north, up; roll, pitch, heading.
     moved_m, turned_rad : ndarray, shape (n + 1, 3)
-        Final path less the odometry, laid on it as a whole: local frame; about the sensor's axes.
+        Final path less the odometry, laid on it as a whole: local frame; about the sensor's axes. Empty without a batch.
     position_s, position_off_m, position_sigma_m : ndarray, shape (k,), (k, 3), (k, 3)
         Stated positions less the path.
     heading_rad, heading_off_rad : ndarray, shape (j,)
@@ -100,18 +100,21 @@ def sheet_of(run: Run | CausalRun, given: Given, trajectory: Trajectory) -> Shee
     knots_ns = boundaries_ns(track, run.motion)
     begin_ns = int(knots_ns[0])
     place = trajectory.after(begin_ns - 1).before(int(knots_ns[-1]))
-    moved, turned = _changed(
-        np.array(track.quat), np.array(track.position_m), run.path.quat[::STEPS], run.path.position_m[::STEPS]
-    )
+    moved, turned = np.zeros((0, 3)), np.zeros((0, 3))
+    if isinstance(run, Run):
+        quat, position_m = run.path.quat[::STEPS], run.path.position_m[::STEPS]
+        moved, turned = _changed(np.array(track.quat), np.array(track.position_m), quat, position_m)
     offs = [_position_off(position_track(given, leg), run.path) for leg in given.placed]
     attitudes = [a for leg in given.placed if (a := attitude_track(leg)) is not None]
-    headings = [_heading_off(a, trajectory) for a in attitudes]
+    headings = [_heading_off(a, run.path, run.mount(given.mount).mat_ins_lidar()) for a in attitudes]
     report = run.report(given.mount)
     compass = report.get("estimated", {}).get("compass_deg")
     blind = float(np.mean(np.array(track.matched) < BLIND_BELOW))
     log = run.windows[-1].log[-1] if isinstance(run, Run) else {}
     parts = [f"{len(track) * 0.1:.0f} s", "causal" if isinstance(run, CausalRun) else f"{len(run.windows)} window(s)"]
     parts += [f"{100.0 * blind:.0f} % without planes", f"{track.restarts} restarts"]
+    if run.is_blind():
+        parts[3] += "; the trajectory is what the adjustment began from"
     if log:
         parts.append(f"lidar chi-square {log['chi_square']:.2f}")
         parts += [
@@ -156,19 +159,23 @@ def _changed(quat: Array, position_m: Array, final_quat: Array, final_position_m
 
 def _position_off(given: Positions, path: SensorPath) -> tuple[Array, Array, Array]:
     """Times, stated positions less those of the path, and their sigmas."""
-    end_ns = path.start_ns + (len(path.quat) - 1) * STEP_NS
-    inside = (given.time_ns >= path.start_ns) & (given.time_ns <= end_ns)
-    node = np.rint((given.time_ns[inside] - path.start_ns) / STEP_NS).astype(np.int64)
+    inside, node = _nodes(given.time_ns, path)
     made = path.position_m[node] + frames.mat_from_quat(path.quat[node]) @ given.lever_m
     return given.time_ns[inside].astype(np.float64), given.position_m[inside] - made, given.sigma_m[inside]
 
 
-def _heading_off(given: Attitudes, trajectory: Trajectory) -> tuple[Array, Array]:
-    """Headings of the trajectory, and stated ones less them."""
-    poses, covered = trajectory.where_covered(given.time_ns)
-    made = frames.attitude_of(frames.mat_from_quat(poses.quat_local_ins_wxyz[covered]))[0]
-    stated = frames.attitude_of(frames.mat_from_quat(given.quat[covered]))[0]
+def _heading_off(given: Attitudes, path: SensorPath, mat_ins_lidar: Array) -> tuple[Array, Array]:
+    """Headings of the path, and stated ones less them."""
+    inside, node = _nodes(given.time_ns, path)
+    made = frames.attitude_of(frames.mat_from_quat(path.quat[node]) @ mat_ins_lidar.T)[0]
+    stated = frames.attitude_of(frames.mat_from_quat(given.quat[inside]))[0]
     return made % (2.0 * np.pi), (stated - made + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _nodes(time_ns: npt.NDArray[np.int64], path: SensorPath) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """Which times lie on a path, and the nearest nodes of its grid to these."""
+    inside = (time_ns >= path.start_ns) & (time_ns <= path.start_ns + (len(path.quat) - 1) * STEP_NS)
+    return inside, np.rint((time_ns[inside] - path.start_ns) / STEP_NS).astype(np.int64)
 
 
 def draw_adjustment(path: Path, sheet: Sheet) -> None:
@@ -198,8 +205,12 @@ def draw_adjustment(path: Path, sheet: Sheet) -> None:
     axis.plot(sheet.slice_s, 100.0 * sheet.residual_m, lw=1, label="RMS off the plane, odometry")
     _finish(axis, "distance [cm]")
     knots = np.concatenate([[0.0], sheet.slice_s])[: len(sheet.moved_m)]
-    _lines(axes[2][0], knots, 100.0 * sheet.moved_m, ("east", "north", "up"), "path - odometry [cm]")
-    _lines(axes[2][1], knots, np.rad2deg(sheet.turned_rad), ("x", "y", "z of the sensor"), "path - odometry [deg]")
+    if len(knots):
+        _lines(axes[2][0], knots, 100.0 * sheet.moved_m, ("east", "north", "up"), "path - odometry [cm]")
+        _lines(axes[2][1], knots, np.rad2deg(sheet.turned_rad), ("x", "y", "z of the sensor"), "path - odometry [deg]")
+    else:
+        for axis in axes[2]:
+            axis.set_visible(False)
     axis = axes[3][0]
     for i, name in enumerate(("east", "north", "up")):
         axis.plot(sheet.position_s, sheet.position_off_m[:, i], **DOT, color=f"C{i}", label=name)
@@ -209,7 +220,7 @@ def draw_adjustment(path: Path, sheet: Sheet) -> None:
             left = sheet.slice_s[start - 1] if start else 0.0
             axis.axvspan(float(left), float(sheet.slice_s[end - 1]), color="0.85", zorder=0)
         axis.set_xlim(0.0, float(sheet.slice_s[-1]))
-    for axis in axes[3][0], axes[2][1]:
+    for axis in axes[3][0], axes[2][1], axes[1][1]:
         axis.set_xlabel("time [s]")
     _draw_compass(axes[3][1], sheet)
     _draw_table(figure.add_subplot(grid[4, :]), rows)

@@ -74,10 +74,11 @@ def test_the_table_has_units_that_people_read_and_tells_what_is_held(sheet: Shee
 
 def test_a_picture_is_drawn_with_and_without_parameters(sheet: Sheet, tmp_path: Path) -> None:
     heights = []
-    for one in (
-        sheet,
-        replace(sheet, estimated={}, curve_rad=None, heading_rad=np.zeros(0), heading_off_rad=np.zeros(0)),
-    ):
+    none, no_rows = np.zeros(0), np.zeros((0, 3))
+    bare = replace(
+        sheet, estimated={}, curve_rad=None, heading_rad=none, heading_off_rad=none, moved_m=no_rows, turned_rad=no_rows
+    )
+    for one in (sheet, bare):
         draw_adjustment(tmp_path / "adjustment.png", one)
         head = (tmp_path / "adjustment.png").read_bytes()[:24]
         assert head[:8] == b"\x89PNG\r\n\x1a\n"
