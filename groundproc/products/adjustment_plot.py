@@ -182,8 +182,9 @@ def draw_adjustment(path: Path, sheet: Sheet) -> None:
     """Draw the sheet."""
     rows = _table(sheet.estimated)
     below = 0.1 + 0.21 * ((len(rows) + 1) // 2 + 1)  # inches of the table
-    figure = Figure(figsize=(13, 11 + below), layout="constrained")
-    grid = figure.add_gridspec(5, 2, height_ratios=[2.6, 2.6, 2.6, 2.6, below])
+    changed = 2.6 if len(sheet.moved_m) else 0.01
+    figure = Figure(figsize=(13, 8.4 + changed + below), layout="constrained")
+    grid = figure.add_gridspec(5, 2, height_ratios=[2.6, 2.6, changed, 2.6, below])
     axes = [[figure.add_subplot(grid[row, column]) for column in range(2)] for row in range(4)]
     figure.suptitle(sheet.title, fontsize=10)
     _lines(axes[0][0], sheet.sigma_s, sheet.sigma_position_m, ("east", "north", "up"), "position sigma [m]")

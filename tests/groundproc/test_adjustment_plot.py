@@ -26,7 +26,7 @@ def sheet() -> Sheet:
     matched = np.full(100, 2000.0)
     matched[40:60] = 3.0
     return Sheet(
-        "a flight", 0.1 * np.arange(1, 101), matched, np.full(100, 3000.0), np.where(matched > 50, 0.02, np.nan),
+        "a flight", np.linspace(0.1, 10.0, 100), matched, np.full(100, 3000.0), np.where(matched > 50, 0.02, np.nan),
         np.arange(0, 10, 0.5), rng.uniform(0.5, 1.0, (20, 3)), rng.uniform(1e-4, 1e-3, (20, 3)), rng.normal(0, 0.01, (101, 3)),
         rng.normal(0, 1e-4, (101, 3)), np.arange(0, 10, 0.3), rng.normal(0, 1, (34, 3)), np.ones((34, 3)), rng.uniform(0, 6.28, 99),
         rng.normal(0, 0.1, 99), np.deg2rad([1.0, 8.0, 0.0, 0.0, 2.0]),
