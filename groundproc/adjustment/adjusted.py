@@ -17,7 +17,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.adjustment.anchors import Attitudes, Positions
-from groundproc.adjustment.batch import COMPASS_PRIOR, PRIORS, turned
+from groundproc.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
 from groundproc.adjustment.beginning import BEGINNING, redo_beginning
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
@@ -157,6 +157,12 @@ class Run:
         if moved > UNSETTLED_M:
             found.append(
                 f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
+            )
+        slid = max(window.log[-1]["position_drift"] for window in self.windows)
+        if slid > 6.0:
+            found.append(
+                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under 6; the lidar may have been "
+                "misled there"
             )
         off = max(window.log[-1].get("position_rms", 0.0) for window in self.windows)
         if off > 4.0:

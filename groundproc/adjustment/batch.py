@@ -140,6 +140,7 @@ class Batch:
             }
             | {f"{f.name}_rms": f.rms() for f in factors}
         )  # fmt: skip
+        self.log[-1]["position_drift"] = drift(factors)
         before = self.path.position_m[::STEPS]
         self.take(unknowns, x)
         moved = self.path.position_m[::STEPS] - before
@@ -151,17 +152,7 @@ class Batch:
         found: list[Factor] = []
         values: dict[str, Array] = {"compass": self.compass}
         for unit in self.units:
-            turn = turn_factor(unit, self.path, unknowns)
-            if weigh:
-                unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), 0.4 * unit.sigma_turn_rad)
-                turn.sigma[:] = unit.sigma_turn_rad
-            found.append(turn)
-            if unit.force_known.any():
-                force = force_factor(unit, self.path, unknowns)
-                if weigh:
-                    unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), 0.4 * unit.sigma_force_m_s2)
-                    force.sigma[:] = unit.sigma_force_m_s2
-                found.append(force)
+            found += self._inertial(unit, unknowns, weigh)
             values |= {f"{unit.name}.{name}": value for name, value in unit.values.items()}
         if "ins.lever" in values:
             values["ins.lever"] = values["ins.lever"] - self.lever_ins_m
@@ -182,6 +173,22 @@ class Batch:
         found.append(prior_factor(unknowns, values))
         return found
 
+    def _inertial(self, unit: Unit, unknowns: Unknowns, weigh: bool) -> list[Factor]:
+        """Gyro and accelerometer of a unit, with the noise that their residuals show where that is asked for."""
+        found: list[Factor] = []
+        turn = turn_factor(unit, self.path, unknowns)
+        if weigh:
+            unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), 0.4 * unit.sigma_turn_rad)
+            turn.sigma[:] = unit.sigma_turn_rad
+        found.append(turn)
+        if unit.force_known.any():
+            force = force_factor(unit, self.path, unknowns)
+            if weigh:
+                unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), 0.4 * unit.sigma_force_m_s2)
+                force.sigma[:] = unit.sigma_force_m_s2
+            found.append(force)
+        return found
+
     def take(self, unknowns: Unknowns, x: Array) -> None:
         """Put a solution in."""
         part = {name: x[place] for name, place in unknowns.names.items()}
@@ -200,6 +207,20 @@ class Batch:
                     unit.values[name] = unit.values[name] + change
             if f"{unit.name}.delay" in part:
                 place_on_grid(unit, self.tracks[unit.name], self.path)
+
+
+DRIFT_S: Final = 10
+
+
+def drift(factors: Sequence[Factor]) -> float:
+    """Largest mean of ten whitened position residuals on end, in sigmas of such a mean: a path that slides away from the fixes."""
+    largest = 0.0
+    for factor in factors:
+        if factor.name == "position" and len(factor.residual) > 3 * DRIFT_S:
+            whitened = (factor.residual / factor.sigma).reshape(-1, 3)
+            sums = np.cumsum(whitened, axis=0)
+            largest = max(largest, float(np.abs(sums[DRIFT_S:] - sums[:-DRIFT_S]).max()) / np.sqrt(DRIFT_S))
+    return largest
 
 
 @dataclass(slots=True)

@@ -320,23 +320,10 @@ def _planes(
 
 
 @njit(cache=True, nogil=True)
-def _choose(first: Any, order: Any, knot: Any, normals: Any, flat: Any, intervals: int, most: int) -> Any:
-    """Positions in `order` of the rows to keep: of planes only, at most `most` of a slice.
-
-    Rows are thinned by the direction of their planes, so that few walls count as much as all the ground.
-    """
-    bins = np.zeros((intervals, 4), np.int64)
-    kind = np.empty(len(flat), np.int8)
-    for v in range(len(flat)):
-        a, b, c = abs(normals[v, 0]), abs(normals[v, 1]), abs(normals[v, 2])
-        kind[v] = 3 if c > 0.9 else (2 if c > 0.5 else (0 if a > b else 1))
-        if flat[v] < 0.0:
-            continue
-        for at in range(first[v], first[v + 1]):
-            bins[knot[order[at]], kind[v]] += 1
-    # even shares, what one direction does not use goes to the others
-    share = np.empty((intervals, 4))
-    for k in range(intervals):
+def _shares(bins: Any, most: int) -> Any:
+    """Part of each slice's rows to keep by direction: even numbers, and what one direction does not use goes to the others."""
+    share = np.empty(bins.shape)
+    for k in range(len(bins)):
         left, open_bins = np.float64(most), 4
         share[k, :] = -1.0
         for _ in range(4):
@@ -353,6 +340,25 @@ def _choose(first: Any, order: Any, knot: Any, normals: Any, flat: Any, interval
         for b in range(4):
             if share[k, b] < 0.0:
                 share[k, b] = left / open_bins / bins[k, b]
+    return share
+
+
+@njit(cache=True, nogil=True)
+def _choose(first: Any, order: Any, knot: Any, normals: Any, flat: Any, intervals: int, most: int) -> Any:
+    """Positions in `order` of the rows to keep: of planes only, at most `most` of a slice.
+
+    Rows are thinned by the direction of their planes, so that few walls count as much as all the ground.
+    """
+    bins = np.zeros((intervals, 4), np.int64)
+    kind = np.empty(len(flat), np.int8)
+    for v in range(len(flat)):
+        a, b, c = abs(normals[v, 0]), abs(normals[v, 1]), abs(normals[v, 2])
+        kind[v] = 3 if c > 0.9 else (2 if c > 0.5 else (0 if a > b else 1))
+        if flat[v] < 0.0:
+            continue
+        for at in range(first[v], first[v + 1]):
+            bins[knot[order[at]], kind[v]] += 1
+    share = _shares(bins, most)
     keep = np.empty(len(order), np.int64)
     count = 0
     for v in range(len(flat)):
@@ -405,29 +411,35 @@ def _linearise(
                 nx * (t[0] * nx + 2 * t[1] * ny + 2 * t[2] * nz) + ny * (t[3] * ny + 2 * t[4] * nz) + nz * t[5] * nz
             ) / counts[n]
             variance[i] = max(RANGE_SIGMA_M**2, across) / counts[n]
-        rough, d, a, b = ROUGHNESS_M**2, 0.0, 0.0, 0.0
-        for attempt in range(3):
-            for i in range(first[v], first[v + 1]):
-                weight[i] = 1.0 / (variance[i] + rough)
-                if attempt:
-                    e = _off_plane(i, plane, residual, d, a, b)
-                    z = abs(e) * np.sqrt(weight[i])
-                    if cut and attempt == 2 and z > CUT:
-                        weight[i] = 0.0
-                    elif z > HUBER:
-                        weight[i] *= HUBER / z
-            d, a, b = _plane(first[v], first[v + 1], plane, weight, residual, voxel_m, inverse[v])
-            if attempt == 0:
-                # what the residuals show beyond the noise of the ranges; four of the expected kind go before them
-                squares, expected, count = 0.0, 0.0, 0
-                for i in range(first[v], first[v + 1]):
-                    e = _off_plane(i, plane, residual, d, a, b)
-                    squares += min(e * e, 25.0 * (variance[i] + rough))
-                    expected += variance[i]
-                    count += 1
-                rough = max(
-                    (4.0 * ROUGHNESS_M**2 + squares - expected) / (max(count - 3, 0) + 4.0), 0.25 * ROUGHNESS_M**2
-                )
+        _weigh(first[v], first[v + 1], variance, cut, plane, weight, residual, voxel_m, inverse[v])
+
+
+@njit(cache=True, nogil=True)
+def _weigh(
+    start: int, end: int, variance: Any, cut: bool, plane: Any, weight: Any, residual: Any, voxel_m: float, inverse: Any
+) -> None:
+    """Weights of a voxel's rows, by the noise of the ranges, the roughness that they show and the loss; and its plane with them."""
+    rough, d, a, b = ROUGHNESS_M**2, 0.0, 0.0, 0.0
+    for attempt in range(3):
+        for i in range(start, end):
+            weight[i] = 1.0 / (variance[i] + rough)
+            if attempt:
+                e = _off_plane(i, plane, residual, d, a, b)
+                z = abs(e) * np.sqrt(weight[i])
+                if cut and attempt == 2 and z > CUT:
+                    weight[i] = 0.0
+                elif z > HUBER:
+                    weight[i] *= HUBER / z
+        d, a, b = _plane(start, end, plane, weight, residual, voxel_m, inverse)
+        if attempt == 0:
+            # what the residuals show beyond the noise of the ranges; four of the expected kind go before them
+            squares, expected, count = 0.0, 0.0, 0
+            for i in range(start, end):
+                e = _off_plane(i, plane, residual, d, a, b)
+                squares += min(e * e, 25.0 * (variance[i] + rough))
+                expected += variance[i]
+                count += 1
+            rough = max((4.0 * ROUGHNESS_M**2 + squares - expected) / (max(count - 3, 0) + 4.0), 0.25 * ROUGHNESS_M**2)
 
 
 @njit(cache=True, nogil=True, inline="always")
