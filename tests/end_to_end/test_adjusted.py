@@ -1,0 +1,203 @@
+"""Method `adjusted` from the log on, against the simulation's truth."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flightlog.logfile import LogReader, LogWriter
+from groundproc.accuracy.judge import judge
+from groundproc.accuracy.truth import on_lidar_clock, read_truth
+from groundproc.adjustment import adjusted, windows
+from groundproc.flight import read_flight
+from groundproc.survey import Survey
+from groundproc.timeline import legs
+from groundproc.trajectory import methods
+from groundproc.trajectory.method import Estimate, gather
+
+SECONDS = 20.0
+
+
+@dataclass
+class Judged:
+    """An estimate and its figures."""
+
+    estimate: Estimate
+    figures: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def flight(simulated: Callable[..., Any]) -> Any:
+    """A third of the flight by which methods are judged: along buildings at 5 m/s, gyros at 100 Hz, boresight, delay and scales off."""
+    from simulator.plans import plan
+
+    return simulated("adjusted_flight", "village", SECONDS, plan("survey_fast_gyro").options, seed=11, points=True)
+
+
+@pytest.fixture(scope="module")
+def hover(simulated: Callable[..., Any]) -> Any:
+    """Nothing to see but a flat field."""
+    from simulator.plans import plan
+
+    return simulated("adjusted_hover", "field", 15.0, plan("hover").options, seed=11)
+
+
+def judged(folder: Path, survey: Survey, log: Path | None = None, *, cloud: bool = False) -> Judged:
+    """Estimate, and compare with the truth as the benchmark does."""
+    truth = read_truth(folder)
+    with LogReader(log or truth.log) as reader:
+        read = read_flight([reader], "ins")
+        timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+        given = gather([reader], read, timeline, truth.nominal_mount, survey)
+        made = methods.estimate(given, lambda stage, size: None)
+        placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
+        found = judge([reader] if cloud else [], truth, placed, made.mount, made.lasers)
+    return Judged(made, found.figures)
+
+
+@pytest.fixture(scope="module")
+def whole(flight: Any) -> Judged:
+    return judged(flight.folder, Survey(), cloud=True)
+
+
+@pytest.fixture(scope="module")
+def autopilots(flight: Any) -> Judged:
+    return judged(flight.folder, Survey(method="ins"))
+
+
+@contextmanager
+def short_windows(slices: int, overlap: int) -> Iterator[None]:
+    """Windows of a long flight, on a short one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adjusted, "WINDOW", slices)
+        for module in (adjusted, windows):
+            patch.setattr(module, "OVERLAP", overlap)
+        yield
+
+
+def test_the_whole_flight_is_right_to_the_sensors_noise(whole: Judged, autopilots: Judged) -> None:
+    figures = whole.figures
+    assert whole.estimate.method == "adjusted"
+    assert whole.estimate.warning == ""
+    assert figures["ate_m"] <= 0.02
+    assert figures["rotation_rms_deg"] <= 0.06
+    assert figures["cloud_floor_ratio"] <= 1.25
+    # what it began from
+    assert autopilots.figures["ate_m"] > 0.2
+    assert autopilots.figures["rotation_rms_deg"] > 1.0
+
+
+def test_what_is_common_to_the_flight_is_found_within_its_sigma(flight: Any, whole: Judged) -> None:
+    """Of three components each, none beyond four sigmas; the boresight was off by up to a degree."""
+    truth = read_truth(flight.folder)
+    estimated = whole.estimate.report["estimated"]
+    off_deg = np.abs(whole.figures["boresight_error_deg"])
+    nominal = judge([], truth, truth.trajectory, truth.nominal_mount).figures
+    assert np.linalg.norm(off_deg) < 0.5 * np.linalg.norm(nominal["boresight_error_deg"])
+    assert (off_deg < 4.0 * np.array(estimated["ins.turn_deg"]["sigma"])).all()
+    for name, entry in estimated.items():
+        value, sigma, prior = (np.array(entry[key]) for key in ("value", "sigma", "prior_sigma"))
+        assert (sigma > 0).all(), name
+        # twelve draws know a sigma to a fifth; no more is claimed than what was known before, and that is within its prior
+        assert (sigma < 2.0 * np.hypot(prior, 0.2)).all(), name
+        assert value.shape == sigma.shape == prior.shape
+
+
+def test_the_same_flight_in_windows_is_as_good(flight: Any, whole: Judged) -> None:
+    """Four windows of 6 s with 2 s in common."""
+    with short_windows(60, 20):
+        made = judged(flight.folder, Survey(method="adjusted"))
+    assert len(made.estimate.report["windows"]) >= 4
+    assert made.estimate.warning == ""
+    assert made.figures["ate_m"] <= 0.02
+    assert made.figures["rotation_rms_deg"] <= 0.06
+    assert made.estimate.trajectory.time_ns[0] == whole.estimate.trajectory.time_ns[0]
+    assert len(made.estimate.trajectory) == len(whole.estimate.trajectory)
+    # no step where windows meet: 5 m/s and what changes it in 5 ms
+    steps = np.linalg.norm(np.diff(made.estimate.trajectory.position_m, n=2, axis=0), axis=1)
+    assert steps.max() < 0.005
+
+
+def test_nothing_of_the_future_costs_centimetres(flight: Any, whole: Judged) -> None:
+    made = judged(flight.folder, Survey(causal=True))
+    assert made.estimate.report["causal"] is True
+    assert made.estimate.warning == ""
+    assert whole.figures["ate_m"] < made.figures["ate_m"] <= 0.05
+
+
+def test_runs_are_alike(flight: Any, whole: Judged) -> None:
+    """Sums over cores are of fixed parts: the same log gives the same trajectory, to rounding."""
+    again = judged(flight.folder, Survey(method="adjusted"))
+    np.testing.assert_allclose(again.estimate.trajectory.position_m, whole.estimate.trajectory.position_m, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def hovered(hover: Any) -> tuple[Judged, Judged]:
+    """By the autopilot and by the adjustment."""
+    return judged(hover.folder, Survey(method="ins")), judged(hover.folder, Survey(method="adjusted"))
+
+
+def test_over_a_flat_field_the_place_is_no_worse_than_the_autopilots(hovered: tuple[Judged, Judged]) -> None:
+    """Only height and tilt have a witness; the place stays what it was, to a hundredth of its error, and its sigma says so."""
+    raw, made = hovered
+    assert made.figures["ate_m"] <= 1.01 * raw.figures["ate_m"]
+    assert made.figures["absolute_rms_m"] <= 1.01 * raw.figures["absolute_rms_m"]
+    assert made.figures["position_within_2_sigma"] >= 0.95
+    assert np.median(made.estimate.trajectory.sigma_position_m[:, :2]) > 0.5
+
+
+@pytest.mark.xfail(reason="over level ground alone the heading drifts by 2 deg in 15 s, beyond its sigma", strict=False)
+def test_over_a_flat_field_the_heading_is_no_worse_than_the_autopilots(hovered: tuple[Judged, Judged]) -> None:
+    raw, made = hovered
+    assert made.figures["rotation_rms_deg"] <= raw.figures["rotation_rms_deg"]
+    assert made.figures["attitude_within_2_sigma"] >= 0.95
+
+
+def test_seconds_without_lidar_are_bridged_and_said(flight: Any, autopilots: Judged, tmp_path: Path) -> None:
+    """4 s dark: what the inertial sensors carry on is off by their noise, 0.3 m/s^2 at 100 Hz and what is left of their bias."""
+    log = tmp_path / "dark.mcap"
+    with LogReader(flight.log) as reader, log.open("wb") as stream:
+        writer = LogWriter(stream, metadata={}, attachments=dict(reader.attachments))
+        for message in reader.messages():
+            since_s = (message.log_time_ns - reader.start_ns) * 1e-9
+            if message.topic != "/velodyne_packets" or not 8.0 <= since_s < 12.0:
+                writer.write(message.topic, message.log_time_ns, bytes(message.data))
+        writer.finish()
+    made = judged(flight.folder, Survey(method="adjusted"), log)
+    assert made.estimate.report["blind_s"] == pytest.approx(4.0, abs=0.3)
+    assert "without planes" in made.estimate.report["note"]
+    assert made.figures["ate_m"] < 0.5 * autopilots.figures["ate_m"]
+    assert made.figures["rotation_rms_deg"] < 0.5 * autopilots.figures["rotation_rms_deg"]
+    # the dark seconds are less certain than those about them
+    track = made.estimate.trajectory
+    seconds = (track.time_ns - track.time_ns[0]) * 1e-9
+    dark, bright = (seconds > 9.0) & (seconds < 11.0), (seconds > 14.0) & (seconds < 18.0)
+    sigma = np.linalg.norm(track.sigma_attitude_rad[:, :2], axis=1)
+    assert np.median(sigma[dark]) > np.median(sigma[bright])
+
+
+def test_a_track_of_a_second_is_refused(flight: Any, tmp_path: Path) -> None:
+    """Ask for it by name and it says what it lacks; as the best it makes room for the next."""
+    log = tmp_path / "short.mcap"
+    with LogReader(flight.log) as reader, log.open("wb") as stream:
+        writer = LogWriter(stream, metadata={}, attachments=dict(reader.attachments))
+        for message in reader.messages():
+            since_s = (message.log_time_ns - reader.start_ns) * 1e-9
+            if message.topic != "/velodyne_packets" or since_s < 1.3:
+                writer.write(message.topic, message.log_time_ns, bytes(message.data))
+        writer.finish()
+    truth = read_truth(flight.folder)
+    with LogReader(log) as reader:
+        read = read_flight([reader], "ins")
+        timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+        given = gather([reader], read, timeline, truth.nominal_mount, Survey())
+        made = methods.estimate(given, lambda stage, size: None)
+        assert made.method == "filtered"
+        assert "tenths of a second" in made.note
+        named = replace(given, survey=Survey(method="adjusted"))
+        with pytest.raises(Exception, match="tenths of a second"):
+            methods.estimate(named, lambda stage, size: None)
