@@ -27,8 +27,8 @@ Foxglove, `rosbags` and `mcap-ros2-support` read it as it is.
 - **Stamps** in records are of the log scale too: `sec`, `nanosec` since 1970. ROS 2 gives `sec` 32 bits, which last until 2038.
 - **The sensors' own stamps** are inside their raw bytes, and are never changed.
 - **Order** in the file is the order of writing. Topics may be out of step with each other by a batch.
-- **Chunks** are of about 1 MiB, with checksums, zstd or as they are. A recorder closes one whenever it syncs to the disk, so a power cut costs what came
-  after the last sync.
+- **Chunks** are of about 1 MiB, with checksums, zstd or as they are. A recorder closes one whenever it syncs to the disk, so a power cut
+  costs what came after the last sync.
 - **A log without footer** is a log: `LogReader` gives all its whole chunks and says that it was cut off. So is one with a damaged
   stretch: it loses the chunks that the damage touches, and says where.
 

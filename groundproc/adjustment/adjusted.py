@@ -149,9 +149,10 @@ class Run:
         """What the self-check found, a sentence each."""
         found = lost(self.track)
         chi_square = max(window.log[-1]["chi_square"] for window in self.windows)
-        if chi_square > 3.0:
+        if chi_square > 2.0:
             found.append(
-                f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1; the cloud may be doubled"
+                f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1 or less; the cloud may be "
+                "doubled"
             )
         moved = max(window.log[-1]["moved_m"] for window in self.windows)
         if moved > UNSETTLED_M:
@@ -161,8 +162,8 @@ class Run:
         slid = max(window.log[-1]["position_drift"] for window in self.windows)
         if slid > 6.0:
             found.append(
-                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under 6; the lidar may have been "
-                "misled there"
+                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under 6; the lidar may "
+                "have been misled there"
             )
         off = max(window.log[-1].get("position_rms", 0.0) for window in self.windows)
         if off > 4.0:

@@ -293,6 +293,26 @@ def observable(information: Any) -> Any:
     return known
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _row(mat: Any, body: Any, nx: float, ny: float, nz: float, out: Any) -> None:
+    """How a distance along a normal changes with the pose of the slice's end: by rotation in the body, and by position."""
+    p = nx * mat[0, 0] + ny * mat[1, 0] + nz * mat[2, 0]
+    q = nx * mat[0, 1] + ny * mat[1, 1] + nz * mat[2, 1]
+    r = nx * mat[0, 2] + ny * mat[1, 2] + nz * mat[2, 2]
+    out[0], out[1], out[2] = body[1] * r - body[2] * q, body[2] * p - body[0] * r, body[0] * q - body[1] * p
+    out[3], out[4], out[5] = nx, ny, nz
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add(row: Any, weight: float, residual: float, information: Any, pull: Any) -> None:
+    """Add a row to the lower half of the information and to the pull."""
+    for a in range(6):
+        weighted = weight * row[a]
+        pull[a] += weighted * residual
+        for b in range(a + 1):
+            information[a, b] += weighted * row[b]
+
+
 @njit(cache=True, nogil=True)
 def _accumulate(
     table: Any, keys: Any, voxels: Any, per_m: float, body: Any, counts: Any, mat: Any, position: Any, gate: float,
@@ -322,28 +342,11 @@ def _accumulate(
         weight = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
         matched += 1
         squares += e * e
-        for level in range(2):
-            if level:
-                if abs(nz) < GROUND:
-                    for a in range(6):  # as it is: j still holds it
-                        wa = weight * j[a]
-                        level_pull[a] += wa * e
-                        for b in range(a + 1):
-                            level_added[a, b] += wa * j[b]
-                    continue
-                nx, ny, nz = 0.0, 0.0, 1.0 if nz > 0.0 else -1.0
-            # normal in the body
-            p = nx * mat[0, 0] + ny * mat[1, 0] + nz * mat[2, 0]
-            q = nx * mat[0, 1] + ny * mat[1, 1] + nz * mat[2, 1]
-            r = nx * mat[0, 2] + ny * mat[1, 2] + nz * mat[2, 2]
-            j[0], j[1], j[2] = by * r - bz * q, bz * p - bx * r, bx * q - by * p
-            j[3], j[4], j[5] = nx, ny, nz
-            to, of = (level_added, level_pull) if level else (added, pull)
-            for a in range(6):
-                wa = weight * j[a]
-                of[a] += wa * e
-                for b in range(a + 1):
-                    to[a, b] += wa * j[b]
+        _row(mat, body[n], nx, ny, nz, j)
+        _add(j, weight, e, added, pull)
+        if abs(nz) > GROUND:
+            _row(mat, body[n], 0.0, 0.0, 1.0 if nz > 0.0 else -1.0, j)
+        _add(j, weight, e, level_added, level_pull)
     for a in range(6):
         for b in range(a):
             added[b, a], level_added[b, a] = added[a, b], level_added[a, b]

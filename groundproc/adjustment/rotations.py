@@ -67,7 +67,7 @@ def flattest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, n
     mean = (xx + yy + zz) / 3.0
     a, b, c = xx - mean, yy - mean, zz - mean
     off = xy * xy + xz * xz + yz * yz
-    p = np.sqrt(max((a * a + b * b + c * c + 2.0 * off) / 6.0, 1e-300))
+    p = np.sqrt(max((a * a + b * b + c * c + 2.0 * off) / 6.0, 1e-60))
     det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
     ratio = min(max(0.5 * det / (p * p * p), -1.0), 1.0)
     angle = np.arccos(ratio) / 3.0
