@@ -66,6 +66,8 @@ class LidarReadings:
     def __init__(self, port: LidarPort, interface: str | None) -> None:
         self._port, self._interface = port, interface
         self._sensor = ""
+        self._newest = (0, 0)
+        """Time of the newest packet and count of good ones at the status before."""
         self._steady: deque[tuple[int, int]] = deque(maxlen=_RATE_SECONDS + 1)
         """Time and count of good packets at each status of a stream that neither began nor ended since."""
 
@@ -91,11 +93,18 @@ class LidarReadings:
         (then_ns, before), (now_ns, count) = self._steady[0], self._steady[-1]
         return (count - before) * NS_PER_S / (now_ns - then_ns)
 
+    def _rate(self, newest_ns: int, good: int, by_status: float) -> float:
+        """Packets per second by their own times: by those of two statuses it would be off by what one look at the socket brings."""
+        (then_ns, before), self._newest = self._newest, (newest_ns, good)
+        if not then_ns or newest_ns <= then_ns:
+            return by_status
+        return round((good - before) * NS_PER_S / (newest_ns - then_ns), 1)
+
     def status(self, log_ns: int, per_second: PerSecond) -> LidarStatus:
         """What the status says of the lidar; to be asked once a second."""
         counts = self._port.counts
         age_s = _age_s(counts.newest_ns, log_ns)
-        rate = per_second("lidar", counts.good)
+        rate = self._rate(counts.newest_ns, counts.good, per_second("lidar", counts.good))
         rejected = dict(counts.rejected)
         rejected_s = {reason: per_second(reason, count) for reason, count in rejected.items()}
         seen = self._port.view() or SensorView()
