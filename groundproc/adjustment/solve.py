@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,13 @@ ENOUGH: Final = 1e-4
 """The iteration ends where a step lowers the cost by less than this share of all steps so far."""
 
 
+class Factorisation(Protocol):
+    """What a sparse factorisation is used for here."""
+
+    def solve(self, right: Array) -> Array:
+        """The factored matrix's inverse times a vector."""
+
+
 @dataclass(slots=True)
 class Problem:
     """The linear problem of one Gauss-Newton step.
@@ -34,13 +41,15 @@ class Problem:
         Of everything else.
     gradient : ndarray
         Half the gradient of the whole cost.
+    factor : Factorisation
+        Of everything else and a share of the lidar's information: the preconditioner.
     """
 
     rows: Rows
     deflation: float
     normal: sparse.csr_matrix
     gradient: Array
-    factor: object
+    factor: Factorisation
 
     def apply(self, vector: Array) -> Array:
         """The whole normal matrix times a vector."""
@@ -52,7 +61,7 @@ class Problem:
     def solve(self, right: Array, enough: float = ENOUGH) -> tuple[Array, int]:
         """Normal matrix x = right, by preconditioned conjugate gradients; and the steps it took."""
         x, r = np.zeros_like(right), right.copy()
-        z = self.factor.solve(r)  # type: ignore[attr-defined]
+        z = self.factor.solve(r)
         p, rz = z.copy(), float(r @ z)
         gained = 0.0
         for step in range(1, MOST_STEPS + 1):
@@ -63,7 +72,7 @@ class Problem:
             gained += alpha * rz
             if alpha * rz < enough * gained:
                 return x, step
-            z = self.factor.solve(r)  # type: ignore[attr-defined]
+            z = self.factor.solve(r)
             before, rz = rz, float(r @ z)
             p = z + (rz / before) * p
         return x, MOST_STEPS

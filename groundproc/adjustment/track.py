@@ -204,8 +204,10 @@ class Tracker:
             self.track.voxel_m = voxel_m
 
     def _note(self, step: Step | None) -> None:
-        track, state = self.track, self.odometry.state  # type: ignore[union-attr]
+        track, odometry = self.track, self.odometry
         assert track is not None
+        assert odometry is not None
+        state = odometry.state
         track.quat.append(state.quat.copy())
         track.position_m.append(state.position_m.copy())
         track.velocity_m_s.append(state.velocity_m_s.copy())
@@ -217,7 +219,7 @@ class Tracker:
         if step is None or not self._keep:
             track.clusters.append(_NONE)
         else:
-            track.clusters.append(thinned(step.clusters, step.world_m, self.odometry.map, KEPT))  # type: ignore[union-attr]
+            track.clusters.append(thinned(step.clusters, step.world_m, odometry.map, KEPT))
 
     def _take_attitude(self) -> None:
         """The autopilot's attitude of now, once a second."""

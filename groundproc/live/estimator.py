@@ -422,7 +422,8 @@ class Estimator:
             track.first + count - 1, track.quat[-2:], track.position_m[-2:], track.velocity_m_s[-1:], track.gyro_bias[-1:],
             clusters=track.clusters[-1:],
         )  # fmt: skip
-        path = last.causal_path(self._tracker.motion)  # type: ignore[union-attr]
+        assert self._tracker is not None
+        path = last.causal_path(self._tracker.motion)
         if count > 2 * _KEEP:
             gone = count - _KEEP
             track.first += gone
@@ -444,7 +445,9 @@ class Estimator:
     # Positions ------------------------------------------------------------------------------------------------------
 
     def _antenna_m(self) -> Array:
-        state = self._tracker.odometry.state  # type: ignore[union-attr]
+        assert self._tracker is not None
+        assert self._tracker.odometry is not None
+        state = self._tracker.odometry.state
         return np.asarray(state.position_m + frames.mat_from_quat(state.quat[None])[0] @ self._antenna)
 
     def _take_fixes(self, boot: Boot, tie: Tie) -> None:
