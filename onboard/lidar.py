@@ -101,7 +101,7 @@ class PacketFields:
     def __init__(self, slots: npt.NDArray[np.void]) -> None:
         data = slots["data"]
         self._flag = data["blocks"]["flag"]
-        offset = SCAN_PACKET_DTYPE.fields["data"][1] + hdl32e.DATA_BYTES - 2  # type: ignore[index]
+        offset = SCAN_PACKET_DTYPE.fields["data"][1] + hdl32e.DATA_BYTES - 2  # type: ignore[index]  # numpy types the fields as optional; this dtype has them
         self._kind = np.ndarray(slots.shape, "<u2", slots, offset, slots.strides)
 
     def good(self, count: int) -> bool:
