@@ -114,6 +114,26 @@ class LidarTimes:
         return LidarRun(int(receive[0]), int(receive[-1]), line, gyro, tuple(self._fixes))
 
 
+class _Search(threading.Thread):
+    """One search; `found` is a tie, or why there is none, once it has ended."""
+
+    def __init__(self, run: LidarRun, frames: list[Frame], mat_ins_lidar: Array, how: str) -> None:
+        super().__init__(name="sync", daemon=True)
+        self.found: Tie | str = ""
+        self._run, self._frames, self._mat, self._how = run, frames, mat_ins_lidar, how
+
+    def run(self) -> None:
+        boot = newest_boot(self._frames)
+        if boot is None:
+            self.found = "no heartbeat of an autopilot"
+            return
+        try:
+            leg = timeline.legs([self._run], [boot], self._mat, self._how)[0]
+            self.found = tie_of(leg, self._mat, self._run.line.device_ns(self._run.last_receive_ns))
+        except (SwathError, np.linalg.LinAlgError) as error:
+            self.found = str(error)
+
+
 class Synchroniser:
     """Finds ties, the expensive ones in a thread of their own so that the odometry never waits.
 
@@ -127,14 +147,12 @@ class Synchroniser:
         self.tie: Tie | None = None
         self.trouble = ""
         self._mat = mat_ins_lidar
-        self._thread: threading.Thread | None = None
-        self._found: list[Tie | str] = []
+        self._search: _Search | None = None
         self._next_s = 0.0
-        self._stale = False
 
     def is_due(self, now_s: float) -> bool:
         """Whether to begin a search; `now_s` is any clock that goes on."""
-        return self._thread is None and not self._found and now_s >= self._next_s
+        return self._search is None and now_s >= self._next_s
 
     def begin(self, now_s: float, times: LidarTimes, gyro: GyroTrack | None, frames: list[Frame]) -> None:
         """Begin a search with what was heard so far."""
@@ -143,52 +161,34 @@ class Synchroniser:
         if run is None or times.span_s < FIRST_S:
             return
         if self.tie is None:
-            self._look(run, frames, "host")
-            return
-        self._thread = threading.Thread(target=self._look, args=(run, frames, "auto"), name="sync", daemon=True)
-        self._thread.start()
+            # receive times are quick, and everything waits for them
+            self._search = _Search(run, frames, self._mat, "host")
+            self._search.run()
+        else:
+            self._search = _Search(run, frames, self._mat, "auto")
+            self._search.start()
 
     def collect(self, now_s: float) -> bool:
         """Take what a search has found; whether there is a new tie."""
-        if self._thread is not None:
-            if self._thread.is_alive():
-                return False
-            self._thread = None
-        return bool(self._found) and self._accept(now_s)
-
-    def _look(self, run: LidarRun, frames: list[Frame], how: str) -> None:
-        boot = newest_boot(frames)
-        if boot is None:
-            self._found = ["no heartbeat of an autopilot"]
-            return
-        try:
-            leg = timeline.legs([run], [boot], self._mat, how)[0]
-            self._found = [tie_of(leg, self._mat, run.line.device_ns(run.last_receive_ns))]
-        except (SwathError, np.linalg.LinAlgError) as error:
-            self._found = [str(error)]
-
-    def _accept(self, now_s: float) -> bool:
-        found, self._found = self._found, []
-        if self._stale:
-            found, self._stale = [], False
+        if self._search is None or self._search.is_alive():
+            return False
+        found, self._search = self._search.found, None
         first = self.tie is None
-        tie = next((f for f in found if isinstance(f, Tie)), None)
-        self.trouble = next((f for f in found if isinstance(f, str)), "")
+        self.trouble = found if isinstance(found, str) else ""
         # receive times never replace what the gyros said
-        if tie is None or (self.tie is not None and self.tie.method == "gyro" and tie.method != "gyro"):
+        if isinstance(found, str) or (self.tie is not None and self.tie.method == "gyro" and found.method != "gyro"):
             if not first:
                 self._next_s = now_s + SOON_S
             return False
-        self.tie = tie
-        self._next_s = now_s + (GYRO_S - FIRST_S if first else LATER_S if tie.method == "gyro" else SOON_S)
+        self.tie = found
+        self._next_s = now_s + (GYRO_S - FIRST_S if first else LATER_S if found.method == "gyro" else SOON_S)
         return True
 
     def forget(self) -> None:
-        """The autopilot's clock has begun anew."""
-        self.tie, self._next_s = None, 0.0
-        self._stale = self._thread is not None
+        """The autopilot's clock has begun anew: what a search that still runs will find is void, nobody waits for it."""
+        self.tie, self._next_s, self._search = None, 0.0, None
 
     def wait(self) -> None:
         """Let a search that runs end."""
-        if self._thread is not None:
-            self._thread.join(10.0)
+        if self._search is not None and self._search.is_alive():
+            self._search.join(10.0)
