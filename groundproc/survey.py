@@ -41,8 +41,8 @@ class Survey:
     )
     positions: str | None = option(
         None,
-        "method filtered: a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), looked for beside this file; "
-        "null: none",
+        "methods adjusted and filtered: a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), looked for "
+        "beside this file; null: none",
     )
     pose_grid_ms: float | None = option(
         None,

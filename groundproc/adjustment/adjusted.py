@@ -16,11 +16,12 @@ from flightlog import frames
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
-from groundproc.adjustment.anchors import Attitudes, Positions
+from groundproc.adjustment.anchors import Attitudes, Positions, within
 from groundproc.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
 from groundproc.adjustment.beginning import BEGINNING, redo_beginning
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
+from groundproc.adjustment.outside import DELAY, outside_track
 from groundproc.adjustment.scans import STEP_NS, STEPS, Slice, slices
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track, Tracker, grid_ns, tracked
@@ -30,6 +31,7 @@ from groundproc.geodesy import LocalFrame
 from groundproc.timeline import Leg
 from groundproc.trajectory import ins
 from groundproc.trajectory.method import Estimate, Given, Progress
+from groundproc.trajectory.outside import surveyed
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
@@ -100,6 +102,7 @@ class Run:
     path : Path
     track : Track
     motion : Motion
+    sources : Sources
     """
 
     SIGMA_SOURCE: ClassVar = (
@@ -111,6 +114,7 @@ class Run:
     path: Path
     track: Track
     motion: Motion
+    sources: Sources
 
     def estimates(self) -> dict[str, tuple[Array, Array]]:
         """Globals over all windows: mean by their variances, and its sigma."""
@@ -170,6 +174,12 @@ class Run:
             found.append(
                 f"the path differs from the GNSS positions by {off:.1f} sigma, expected 1; one of them is wrong"
             )
+        off = max(window.log[-1].get("outside position_rms", 0.0) for window in self.windows)
+        if off > 1.0:
+            found.append(
+                f"the path differs from {self.sources.outside[0].source} by {off:.1f} times what its sigmas explain though its errors "
+                "last, expected under 1; sigmas, lever arm, heights or time scale of that file may be wrong"
+            )
         return found
 
     def blind_s(self) -> float:
@@ -177,8 +187,8 @@ class Run:
         return float(sum(m < 50 for m in self.track.matched[10:]) * H)
 
     def is_blind(self) -> bool:
-        """Whether the lidar saw nothing for most of the flight: then the adjustment knows no more than what it began from."""
-        return self.blind_s() > 0.5 * len(self.track) * H
+        """Whether the lidar saw nothing for most of the flight: without better positions it then knows no more than what it began from."""
+        return self.blind_s() > 0.5 * len(self.track) * H and not self.sources.outside
 
     def note(self) -> str:
         """What a reader must know though nothing is wrong."""
@@ -192,13 +202,20 @@ class Run:
             "and its sigma says so"
         )
 
+    def priors(self) -> dict[str, Array]:
+        """What was known of the globals before, one sigma."""
+        known = {name: np.array(sigma) for name, sigma in PRIORS.items()} | {"compass": COMPASS_PRIOR}
+        outside = self.sources.outside
+        return known | ({DELAY: np.array(outside[0].delay_sigma_s)} if outside else {})
+
     def report(self, nominal: Mount) -> dict[str, Any]:
         """What stands in quality.json."""
         values: dict[str, Any] = {}
+        priors = self.priors()
         for key, (value, sigma) in self.estimates().items():
             name = key.rsplit(".", 1)[-1]
             scale = np.rad2deg(1.0) if name in ("bias", "turn", "accel_turn", "compass") else 1.0
-            prior = COMPASS_PRIOR if name == "compass" else np.full(len(value), PRIORS[key])
+            prior = np.broadcast_to(priors[key], value.shape)
             values[key + _UNITS[name]] = {
                 "value": (value * scale).tolist(),
                 "sigma": (sigma * scale).tolist(),
@@ -215,6 +232,14 @@ class Run:
                 {"start_s": w.first * H, "seconds": (w.last - w.first) * H, "rounds": w.log} for w in self.windows
             ],
             "estimated": values,
+            "outside": [
+                {
+                    "source": outside.source,
+                    "positions": int(within(outside.time_ns, self.path).sum()),
+                    "residual_rms": max(w.log[-1].get("outside position_rms", 0.0) for w in self.windows),
+                }
+                for outside in self.sources.outside
+            ],
             "mount_change": {
                 "yaw_pitch_roll_deg": [
                     mount.lidar.yaw_deg - nominal.lidar.yaw_deg,
@@ -365,6 +390,7 @@ def adjust_run(
         mat,
         lever,
         exact,
+        [outside_track(fixes, mat, lever, legs[0].utc) for fixes in surveyed(given)],
     )
     tracker = Tracker(
         motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
@@ -390,7 +416,7 @@ def adjust_run(
         redo_beginning(track, motion, early, tracker.odometry.state)
     if not windows or len(track) - begin > OVERLAP:
         windows.append(adjust_window(track, motion, sources, begin, len(track), windows))
-    return Run(windows, joined_path(windows), track, motion)
+    return Run(windows, joined_path(windows), track, motion, sources)
 
 
 def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) -> Array:

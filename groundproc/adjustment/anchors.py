@@ -120,7 +120,7 @@ def within(time_ns: Ints, path: Path) -> npt.NDArray[np.bool_]:
     return np.asarray((time_ns >= path.start_ns) & (time_ns <= path.start_ns + (len(path.quat) - 1) * STEP_NS))
 
 
-def _seconds(time_ns: Ints) -> tuple[Ints, Ints]:
+def seconds(time_ns: Ints) -> tuple[Ints, Ints]:
     """Groups of one second: number of each sample's group, counted without gaps, and the middle sample of each group."""
     _, group = np.unique(time_ns // NS_PER_S, return_inverse=True)
     first = np.searchsorted(group, np.arange(group.max() + 1))
@@ -128,7 +128,8 @@ def _seconds(time_ns: Ints) -> tuple[Ints, Ints]:
     return group, (first + last) // 2
 
 
-def _means(values: Array, group: Ints) -> Array:
+def means(values: Array, group: Ints) -> Array:
+    """Mean of the rows of each group."""
     total = np.zeros((group.max() + 1, values.shape[1]))
     np.add.at(total, group, values)
     return np.asarray(total / np.bincount(group)[:, None])
@@ -143,8 +144,8 @@ def position_factor(given: Positions, path: Path, unknowns: Unknowns) -> Factor 
     _, _, step, share = spots(time_ns, path)
     quat, position = poses(path, step, share)
     off = position + frames.mat_from_quat(quat) @ given.lever_m - given.position_m[inside]
-    group, middle = _seconds(time_ns)
-    residual, sigma = _means(off, group), _means(given.sigma_m[inside], group)
+    group, middle = seconds(time_ns)
+    residual, sigma = means(off, group), means(given.sigma_m[inside], group)
     knot, weights, _, _ = spots(time_ns[middle], path)
     count = len(middle)
     builder, row = RowBuilder(3 * count, unknowns), 3 * np.arange(count)
@@ -190,21 +191,21 @@ def attitude_factor(
         [np.ones_like(heading), np.sin(heading), np.cos(heading), np.sin(2 * heading), np.cos(2 * heading)], axis=1
     )
     off[:, 2] -= terms @ compass
-    group, middle = _seconds(time_ns)
+    group, middle = seconds(time_ns)
     count = len(middle)
     knot, weights, _, _ = spots(time_ns[middle], path)
     builder, row = RowBuilder(3 * count, unknowns), 3 * np.arange(count)
     builder.at_times(row, knot, weights, 0, mat[middle])
     builder.by(row, "world.turn", eye(count))
     curve = np.zeros((count, 3, COMPASS_TERMS))
-    curve[:, 2] = -_means(terms, group)
+    curve[:, 2] = -means(terms, group)
     builder.by(row, "compass", curve)
     if turn_name is not None:
         builder.by(row, turn_name, mat[middle])
     sigma = np.tile(given.sigma_rad, (count, 1))
     return whitened(
         "attitude",
-        _means(off, group),
+        means(off, group),
         builder.matrix(),
         time_ns[middle].astype(np.float64) * 1e-9,
         sigma,

@@ -28,6 +28,7 @@ from groundproc.adjustment.factors import (
     turn_factor,
 )
 from groundproc.adjustment.motion import ImuTrack, on_grid
+from groundproc.adjustment.outside import DELAY, Outside, outside_factors
 from groundproc.adjustment.planes import Clusters, rows_of
 from groundproc.adjustment.scans import STEPS
 from groundproc.adjustment.solve import Problem, problem
@@ -79,6 +80,10 @@ class Batch:
         Rows of a slice.
     tie : Tie, optional
         To the window before.
+    outside : sequence of Outside
+        Positions and poses of another program.
+    outside_delay_s : ndarray, shape (1,)
+        Of these.
     """
 
     path: Path
@@ -92,6 +97,8 @@ class Batch:
     compass: Array = field(default_factory=lambda: np.zeros(COMPASS_TERMS))
     most: int = 1000
     tie: Tie | None = None
+    outside: Sequence[Outside] = ()
+    outside_delay_s: Array = field(default_factory=lambda: np.zeros(1))
     log: list[dict[str, float]] = field(default_factory=list)
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
@@ -120,6 +127,8 @@ class Batch:
                 key = f"{unit.name}.{name}"
                 unknowns.add(key, np.full(1 if name == "delay" else 3, PRIORS[key]))
         unknowns.add("compass", COMPASS_PRIOR)
+        if self.outside:
+            unknowns.add(DELAY, np.array([self.outside[0].delay_sigma_s]))
         return unknowns
 
     def step(self, voxel_m: float, cut: bool, weigh: bool) -> "Posterior":
@@ -150,7 +159,7 @@ class Batch:
     def factors(self, unknowns: Unknowns, weigh: bool) -> list[Factor]:
         """Everything but the lidar."""
         found: list[Factor] = []
-        values: dict[str, Array] = {"compass": self.compass}
+        values: dict[str, Array] = {"compass": self.compass, DELAY: self.outside_delay_s}
         for unit in self.units:
             found += self._inertial(unit, unknowns, weigh)
             values |= {f"{unit.name}.{name}": value for name, value in unit.values.items()}
@@ -162,12 +171,13 @@ class Batch:
             factor = position_factor(positions, self.path, unknowns)
             if factor is not None:
                 found.append(factor)
+        turn_name = None if ins is None else "ins.turn"
         for attitudes in self.attitudes:
-            factor = attitude_factor(
-                attitudes, self.path, unknowns, mat, self.compass, None if ins is None else "ins.turn"
-            )
+            factor = attitude_factor(attitudes, self.path, unknowns, mat, self.compass, turn_name)
             if factor is not None:
                 found.append(factor)
+        for outside in self.outside:
+            found += outside_factors(outside, self.path, unknowns, float(self.outside_delay_s[0]), mat, turn_name)
         if self.tie is not None:
             found.append(tie_factor(self.tie, self.path, unknowns))
         found.append(prior_factor(unknowns, values))
@@ -195,6 +205,7 @@ class Batch:
         path = self.path.corrected(x[: unknowns.path_size].reshape(-1, 6))
         self.path = path.turned(turned(part["world.turn"]), part["world.shift"])
         self.compass = self.compass + part["compass"]
+        self.outside_delay_s = self.outside_delay_s + part.get(DELAY, 0.0)
         for unit in self.units:
             for name in unit.values:
                 change = part.get(f"{unit.name}.{name}")

@@ -13,6 +13,7 @@ from groundproc.adjustment.anchors import Attitudes, Positions, Tie
 from groundproc.adjustment.batch import DRAWS, Batch, Posterior, make_unit
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.motion import ImuTrack, Motion
+from groundproc.adjustment.outside import DELAY, Outside
 from groundproc.adjustment.scans import STEPS
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track
@@ -47,6 +48,8 @@ class Sources:
         Nominal mount.
     exact : tuple of str
         Globals whose covariance is wanted exactly.
+    outside : sequence of Outside
+        Positions and poses of another program.
     """
 
     units: Mapping[str, ImuTrack]
@@ -55,6 +58,7 @@ class Sources:
     mat_ins_lidar: Array
     lever_m: Array
     exact: tuple[str, ...] = ()
+    outside: Sequence[Outside] = ()
 
 
 @dataclass(slots=True)
@@ -123,6 +127,7 @@ def adjust_window(
         mat.T,
         to_ins,
         tie=tie,
+        outside=sources.outside,
     )
     posterior = batch.run()
     draws = posterior.draws(DRAWS)
@@ -147,14 +152,16 @@ def _laid_on(path: Path, tie: Tie) -> Path:
 
 def _values(batch: Batch, posterior: Posterior, draws: Array) -> dict[str, tuple[Array, Array]]:
     """Globals with the sigmas of the draws."""
-    found = {}
+    found, common = {}, {"compass": batch.compass, DELAY: batch.outside_delay_s}
     for name, where in posterior.unknowns.names.items():
         unit, _, key = name.partition(".")
         if unit == "world":
             continue
         sigma = np.sqrt(np.mean(np.square(draws[:, where]), axis=0))
-        value = batch.compass if name == "compass" else next(u for u in batch.units if u.name == unit).values[key]
-        found[name] = (value, sigma)
+        if name in common:
+            found[name] = (common[name], sigma)
+        else:
+            found[name] = (next(u for u in batch.units if u.name == unit).values[key], sigma)
     return found
 
 

@@ -45,7 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sync", choices=("auto", "gyro", "host"), help="how the clocks are tied; default: auto")
     parser.add_argument("--fov", metavar="A-B", help="azimuths kept, clockwise, in degrees, or all; default: 255-105")
     parser.add_argument(
-        "--positions", type=Path, metavar="FILE", help="a better GNSS solution or poses, for method filtered"
+        "--positions",
+        type=Path,
+        metavar="FILE",
+        help="a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), for methods adjusted and filtered",
     )
     parser.add_argument("--compass", type=Path, metavar="FILE", help="compass model that method dynamic begins with")
     parser.add_argument(

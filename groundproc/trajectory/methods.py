@@ -43,13 +43,13 @@ def estimate(given: Given, progress: Progress) -> Estimate:
 def candidates(survey: Survey) -> tuple[str, ...]:
     """Methods to try, the best first.
 
-    `best` goes down only as far as the other options allow: only the adjustment is causal, only the filter takes positions in.
+    `best` goes down only as far as the other options allow: only the adjustment is causal, only it and the filter take positions in.
     """
     if survey.method != "best":
         return (survey.method,)
-    if survey.positions is not None:
-        return ("filtered",)
-    return ("adjusted",) if survey.causal else ("adjusted", "filtered", "ins")
+    if survey.causal:
+        return ("adjusted",)
+    return ("adjusted", "filtered") if survey.positions is not None else ("adjusted", "filtered", "ins")
 
 
 def check(survey: Survey) -> None:
@@ -59,10 +59,19 @@ def check(survey: Survey) -> None:
     ------
     UsageError
     """
-    for name, method in OPTIONS_OF.items():
+    first = candidates(survey)[0]
+    for name, users in OPTIONS_OF.items():
         value = getattr(survey, name)
-        if value not in (None, False) and method not in candidates(survey)[:1]:
-            raise UsageError(f"{name}: {value} given, but only method {method} uses it, not {survey.method}")
+        if value in (None, False):
+            continue
+        if first not in users:
+            raise UsageError(
+                f"{name}: {value} given, but only method {' or '.join(users)} uses it, not {survey.method}"
+            )
+        if survey.causal and name != "causal":
+            raise UsageError(
+                f"{name}: {value} given together with causal, which uses nothing that is known after the flight only"
+            )
 
 
 def ins_estimate(given: Given, progress: Progress) -> Estimate:
@@ -106,8 +115,10 @@ def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
     return dynamic.dynamic_estimate(given, progress, METHODS[given.survey.dynamic.start])
 
 
-OPTIONS_OF: Final = {"positions": "filtered", "compass": "dynamic", "causal": "adjusted", "pose_grid_ms": "ins"}
-"""Options of the survey that one method alone looks at."""
+OPTIONS_OF: Final = {
+    "positions": ("adjusted", "filtered"), "compass": ("dynamic",), "causal": ("adjusted",), "pose_grid_ms": ("ins",),
+}  # fmt: skip
+"""Options of the survey that some methods alone look at."""
 
 METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
     "ins": ins_estimate,

@@ -372,7 +372,7 @@ def test_positions_are_named_in_the_survey(ordinary: list[Flown], tmp_path: Path
     with given_of(flown.simulated.log) as given:
         named = replace(given, survey=Survey(method="filtered", positions=str(tmp_path / "better.csv")))
         found = errors(methods.estimate(named, quiet).trajectory, flown.simulated, given.frame)
-        with pytest.raises(UsageError, match="only method filtered"):
+        with pytest.raises(UsageError, match="only method adjusted or filtered"):
             methods.estimate(replace(named, survey=replace(named.survey, method="ins")), quiet)
     inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
     assert np.sqrt(np.mean(np.square(found.position[inside]))) < 0.06

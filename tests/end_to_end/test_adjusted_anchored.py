@@ -1,0 +1,152 @@
+"""Method `adjusted` with what is known of the earth: positions of another program, from the log on, against the simulation's truth."""
+
+import datetime as dt
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flightlog import frames
+from flightlog.logfile import LogReader
+from groundproc.accuracy.judge import judge
+from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
+from groundproc.flight import read_flight
+from groundproc.survey import Survey
+from groundproc.timeline import legs
+from groundproc.trajectory import methods
+from groundproc.trajectory.method import Estimate, Given, gather
+
+Array = npt.NDArray[np.float64]
+SECONDS = 20.0
+EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+UNDULATION_M = 29.354
+"""Of the simulator's origin."""
+ANTENNA = np.array([0.1, -0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def flight(simulated: Callable[..., Any]) -> Any:
+    """The flight of the tests of the adjustment itself."""
+    from simulator.plans import plan
+
+    return simulated("adjusted_flight", "village", SECONDS, plan("survey_fast_gyro").options, seed=11, points=True)
+
+
+@contextmanager
+def given_of(truth: Truth, survey: Survey) -> Iterator[Given]:
+    with LogReader(truth.log) as reader:
+        read = read_flight([reader], "ins")
+        mount = replace(truth.nominal_mount, gps_position_m=tuple(ANTENNA.tolist()))
+        timeline = legs(read.runs, read.boots, mount.mat_ins_lidar(), "auto")
+        yield gather([reader], read, timeline, mount, survey)
+
+
+@dataclass
+class Made:
+    """An estimate with errors of the sensor's poses in the local frame, unaligned, and its error after alignment."""
+
+    estimate: Estimate
+    position_m: Array
+    sigma_m: Array
+    turn_rad: Array
+    relative_m: float
+
+
+def made(folder: Path, survey: Survey) -> Made:
+    truth = read_truth(folder)
+    with given_of(truth, survey) as given:
+        estimate = methods.estimate(given, lambda stage, size: None)
+        found = on_lidar_clock(estimate.trajectory, given.timeline[0].lidar_line, truth)
+    true, covered = truth.trajectory.where_covered(found.time_ns)
+    mat, mat_true = (
+        frames.mat_from_quat(q) for q in (found.quat_local_ins_wxyz[covered], true.quat_local_ins_wxyz[covered])
+    )
+    place = found.position_m[covered] + mat @ estimate.mount.lidar_position_m()
+    place_true = true.position_m[covered] + mat_true @ truth.mount.lidar_position_m()
+    turn = mat @ estimate.mount.mat_ins_lidar() @ np.swapaxes(mat_true @ truth.mount.mat_ins_lidar(), 1, 2)
+    figures = judge([], truth, found, estimate.mount, estimate.lasers).figures
+    sigma = found.sigma_position_m[covered]
+    return Made(
+        estimate, place - place_true, sigma, frames.quat_log(frames.quat_from_mat(turn)), float(figures["ate_m"])
+    )
+
+
+@pytest.fixture(scope="module")
+def plain(flight: Any) -> Made:
+    return made(flight.folder, Survey(method="adjusted"))
+
+
+def write_pos(folder: Path, out: Path, sigma_m: Array, rng: np.random.Generator, wrong: slice = slice(0, 0)) -> None:
+    """What RTKLIB would write of an antenna, 5 Hz, in GPS time and ellipsoidal heights; a stretch of it is half a metre off."""
+    poses = np.genfromtxt(folder / "truth.csv", delimiter=",", names=True, dtype=None)[137::100]
+    angles = np.stack([-poses["heading_deg"], poses["pitch_deg"], poses["roll_deg"]], axis=1)
+    local = np.stack([poses["east_m"], poses["north_m"], poses["up_m"]], axis=1)
+    local += Rotation.from_euler("ZXY", angles, degrees=True).apply(ANTENNA)
+    local += sigma_m * rng.standard_normal(local.shape)
+    local[wrong] += [0.3, -0.3, 0.3]
+    origin = read_truth(folder).content["local_origin"]
+    to_local = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +step +proj=topocentric "
+        f"+lat_0={origin['latitude_deg']} +lon_0={origin['longitude_deg']} +h_0={origin['height_msl_m'] + UNDULATION_M}"
+    )
+    east, north, up = local.T
+    longitude, latitude, height = to_local.transform(east, north, up, direction="INVERSE")
+    lines = [
+        "%  GPST  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio"
+    ]
+    for i, utc_ns in enumerate(poses["utc_ns"].tolist()):
+        stamp = EPOCH + dt.timedelta(microseconds=utc_ns // 1000 + 18_000_000)
+        lines.append(
+            f"{stamp:%Y/%m/%d %H:%M:%S}.{stamp.microsecond // 1000:03d} {latitude[i]:.10f} {longitude[i]:.10f} {height[i]:.4f} 1 12 "
+            f"{sigma_m[1]:.4f} {sigma_m[0]:.4f} {sigma_m[2]:.4f} 0 0 0 0.0 50.0"
+        )
+    out.write_text("\n".join(lines) + "\n")
+
+
+SIGMA = np.array([0.01, 0.01, 0.015])
+
+
+@pytest.fixture(scope="module")
+def positioned(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    path = tmp_path_factory.mktemp("positions") / "better.pos"
+    write_pos(flight.folder, path, SIGMA, np.random.default_rng(4))
+    return made(flight.folder, Survey(positions=str(path), geoid=UNDULATION_M))
+
+
+def test_centimetre_positions_make_the_whole_right_to_centimetres(plain: Made, positioned: Made) -> None:
+    assert positioned.estimate.method == "adjusted"
+    assert not positioned.estimate.warning
+    # without, the GNSS's metres
+    assert np.linalg.norm(plain.position_m.mean(axis=0)) > 0.5
+    assert np.sqrt(np.mean(np.square(positioned.position_m).sum(axis=1))) < 0.03
+    assert (np.abs(positioned.position_m) < 3.0 * positioned.sigma_m).mean() > 0.95
+    assert (np.median(positioned.sigma_m, axis=0) < 0.05).all()
+    # the heading of the whole is that of the track, 15 m of it known to some millimetres; tilt is gravity's as before
+    assert np.abs(np.rad2deg(positioned.turn_rad.mean(axis=0))).max() < 0.15
+
+
+def test_centimetre_positions_leave_the_shape_to_the_lidar(plain: Made, positioned: Made) -> None:
+    assert positioned.relative_m < 1.15 * plain.relative_m + 2e-4
+
+
+def test_what_the_clocks_differ_by_is_found_with_the_positions(positioned: Made, flight: Any) -> None:
+    """The lidar's UTC comes by way of the autopilot, 8 ms late by its gyros."""
+    found = positioned.estimate.report["estimated"]["outside.delay_s"]
+    assert found["value"][0] == pytest.approx(-0.0084, abs=3.0 * found["sigma"][0])
+    assert found["sigma"][0] < 0.7 * found["prior_sigma"][0]
+    (source,) = positioned.estimate.report["outside"]
+    assert source["positions"] > 90
+
+
+def test_a_wrong_fix_of_some_seconds_is_not_followed(flight: Any, tmp_path: Path) -> None:
+    write_pos(flight.folder, tmp_path / "wrong.pos", SIGMA, np.random.default_rng(4), slice(40, 60))
+    found = made(flight.folder, Survey(positions=str(tmp_path / "wrong.pos"), geoid=UNDULATION_M))
+    # a fifth of the fixes is 0.52 m off: their mean would be off by 0.1 m
+    assert np.sqrt(np.mean(np.square(found.position_m).sum(axis=1))) < 0.05
