@@ -11,8 +11,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
-NO_BENCHMARKS = ("all", "drawing", "long_log", "machine")
-"""This one, and what others use."""
+NO_BENCHMARKS = ("all", "drawing", "long_log", "machine", "study")
+"""This one, what others use, and what takes hours."""
 LIBRARIES = (
     "swath", "numpy", "numba", "scipy", "mcap", "laspy", "lazrs", "pyproj", "pymavlink", "velodyne-decoder", "kiss-icp", "small_gicp",
 )  # fmt: skip

@@ -36,11 +36,12 @@ from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy.cloud import Section, choose_section
 from groundproc.accuracy.judge import judge
-from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
+from groundproc.accuracy.truth import Clock, Truth, on_lidar_clock, read_truth
 from groundproc.decode import LaserTable
 from groundproc.flight import read_flight
 from groundproc.mounting import find_mount
 from groundproc.survey import Survey
+from groundproc.sync.result import Sync
 from groundproc.timeline import legs
 from groundproc.trajectory import methods
 from groundproc.trajectory.method import gather
@@ -92,6 +93,7 @@ class Made:
     """Cores that other programs took meanwhile."""
     warning: str = ""
     report: dict[str, Any] = field(default_factory=dict)
+    tie: dict[str, float] = field(default_factory=dict)
 
 
 def own_methods() -> list[str]:
@@ -157,7 +159,26 @@ def _method(name: str, truth: Truth, reader: LogReader) -> Made:
     if len({leg.run for leg in timeline}) > 1:
         raise SystemExit(f"{reader.path}: the lidar's clock was set in flight, expected one run of it")
     placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
-    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning, estimate.report)
+    tie = tie_errors(timeline[0].sync, truth)
+    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning, estimate.report, tie)
+
+
+def tie_errors(sync: Sync, truth: Truth) -> dict[str, float]:
+    """Errors of the tie between the clocks of autopilot and lidar, with the sigmas that it states.
+
+    The true offset is that at which the autopilot's rates say what the lidar's do: delays of its filters are part of it.
+    """
+    boot = Clock(**truth.content["clocks"]["boot"])
+    at_ns = truth.from_device_ns(np.array([sync.reference_ns]))
+    late_ns = truth.content["ins_gyro_delay_s"] * 1e9
+    true_ns = boot.shows_ns(truth.lidar.elapsed_s(at_ns)) + late_ns - sync.reference_ns
+    drift_ppm = ((1.0 + boot.drift_ppm * 1e-6) / (1.0 + truth.lidar.drift_ppm * 1e-6) - 1.0) * 1e6
+    return {
+        "offset_error_ms": float(sync.offset_ns - true_ns[0]) * 1e-6,
+        "sigma_offset_ms": sync.sigma_offset_ns * 1e-6,
+        "drift_error_ppm": sync.drift_ppm - drift_ppm,
+        "sigma_drift_ppm": sync.sigma_drift_ppm,
+    }
 
 
 def _odometry(name: str, truth: Truth, reader: LogReader) -> Made:
@@ -197,6 +218,7 @@ def one(name: str, folder: Path, results: Path, section: Section | None) -> None
         }
     figures |= {"warning": made.warning} if made.warning else {}
     figures |= {"report": made.report} if made.report else {}
+    figures |= {"tie": made.tie} if made.tie else {}
     (results / f"{name}.json").write_text(json.dumps(found.figures | figures, indent=1, default=float) + "\n")
     np.savez_compressed(results / f"{name}.npz", **found.courses)
 
@@ -217,11 +239,12 @@ def run(name: str, folder: Path, results: Path) -> dict[str, Any]:
     return figures
 
 
-def simulate(folder: Path, flight: str, seconds: float | None, seed: int, points: bool) -> None:
-    """Simulate a named flight into a folder."""
+def simulate(folder: Path, flight: str, seconds: float | None, seed: int, points: bool, *more: str) -> None:
+    """Simulate a named flight into a folder; `more` are further words of `swath simulate`."""
     words = ["simulate", "--flight", flight, "--seed", str(seed), "-o", str(folder)]
     words += ["--duration", str(seconds)] if seconds else []
     words += ["--truth-points"] if points else []
+    words += more
     subprocess.run([Path(sys.executable).with_name("swath"), *words], check=True, stdout=subprocess.DEVNULL)
 
 

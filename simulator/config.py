@@ -88,6 +88,7 @@ class FlightOptions:
 
     route: str = option("", "which of the scene's routes; empty: its first")
     speed_m_s: float = option(0.0, "speed along the route; 0: the route's own [m/s]", minimum=0, maximum=50)
+    higher_m: float = option(0.0, "the route lies so much higher [m]", minimum=-100, maximum=1000)
     vibration_deg: float = option(
         0.03, "rotor vibration of each attitude angle, rms [deg], 15 to 40 Hz", minimum=0, maximum=5
     )
@@ -205,6 +206,12 @@ class LinkOptions:
 class MountOptions:
     """How the true mount differs from the nominal one that is written into the log."""
 
+    lidar_position_m: tuple[float, float, float] | None = option(
+        None, "nominal lever arm of the lidar: right, forward, up [m]; null: the scene's", minimum=-5, maximum=5
+    )
+    lidar_deg: tuple[float, float, float] | None = option(
+        None, "nominal yaw, pitch, roll of the lidar [deg]; null: the scene's", minimum=-180, maximum=180
+    )
     boresight_deg: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), "true minus nominal yaw, pitch, roll of the lidar [deg]", minimum=-20, maximum=20
     )

@@ -112,6 +112,9 @@ class Flight:
         share = _SHARE[route.kind]
         if options.speed_m_s > 0:
             route = dataclasses.replace(route, speed_m_s=options.speed_m_s)
+        if options.higher_m:
+            points = tuple((x, y, z + options.higher_m) for x, y, z in route.points_m)
+            route = dataclasses.replace(route, points_m=points)
         self.duration_s = duration_s
         self._vibration = _sines(rng, _VIBRATION_LINES, (15.0, 40.0), share * np.radians(options.vibration_deg))
         tilt = _sines(rng, _WANDER_LINES, (0.2, 3.0), share * np.radians(options.wander_deg))

@@ -65,8 +65,15 @@ class Job:
 
 
 def logged_mount(scenes: Mount, options: Options) -> Mount:
-    """The nominal mount, as the log has it: the scene's, with the antenna of the options."""
-    return dataclasses.replace(scenes, gps_position_m=options.mount.gps_position_m)
+    """The nominal mount, as the log has it: the scene's where the options do not say otherwise, with the antenna of the options."""
+    o = options.mount
+    lidar = scenes.lidar
+    if o.lidar_position_m is not None:
+        lidar = dataclasses.replace(lidar, position_m=o.lidar_position_m)
+    if o.lidar_deg is not None:
+        yaw, pitch, roll = o.lidar_deg
+        lidar = dataclasses.replace(lidar, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
+    return dataclasses.replace(scenes, lidar=lidar, gps_position_m=o.gps_position_m)
 
 
 def true_mount(nominal: Mount, options: Options, seed: int) -> Mount:

@@ -26,6 +26,7 @@ from simulator.moving import Tracks, flat, over_ground
 from simulator.parts import Parts, World
 from simulator.route import Route, eights
 from simulator.town import town
+from simulator.wood import wood
 
 Array = npt.NDArray[np.float64]
 Place = tuple[World, dict[str, Route], Tracks]
@@ -192,6 +193,7 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] =
     "panels": (panels, _LEVEL),
     "town": (town, Mount()),
     "lake": (lake, Mount()),
+    "wood": (wood, Mount()),
 }
 
 

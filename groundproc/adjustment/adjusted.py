@@ -280,7 +280,7 @@ def of_ins(
 
 
 _UNITS: Final = {
-    "bias": "_deg_s", "scale": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2",
+    "bias": "_deg_s", "scale": "", "shear": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2",
     "accel_turn": "_deg", "lever": "_m",
     "compass": "_deg",
 }  # fmt: skip

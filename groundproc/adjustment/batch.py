@@ -48,13 +48,14 @@ DRAWS: Final = 12
 """Draws from the posterior that the sigmas are from: right to a fifth."""
 
 PRIORS: Final[dict[str, float]] = {
-    "lidar.bias": np.deg2rad(50.0), "lidar.scale": 0.01, "lidar.turn": np.deg2rad(0.3), "lidar.accel_bias": 0.5,
+    "lidar.bias": np.deg2rad(50.0), "lidar.scale": 0.01, "lidar.shear": 0.01, "lidar.turn": np.deg2rad(0.3), "lidar.accel_bias": 0.5,
     "lidar.accel_turn": np.deg2rad(0.5), "lidar.lever": 0.15,
-    "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5,
+    "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.shear": 0.01, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5,
     "ins.accel_turn": np.deg2rad(0.5), "ins.lever": 0.05, "ins.delay": 0.01,
 }  # fmt: skip
-"""What is known before, one sigma: gyro bias [rad/s], scale, misalignment against the lidar's optics [rad], bias [m/s^2] and
-misalignment against the gyro of the accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s]."""
+"""What is known before, one sigma: gyro bias [rad/s], scale, what an axis feels of the two others (scales of axes that lie askew in the
+sensor's frame are of that kind), misalignment against the lidar's optics [rad], bias [m/s^2] and misalignment against the gyro of the
+accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s]."""
 COMPASS_PRIOR: Final = np.deg2rad([5.0, 10.0, 10.0, 4.0, 4.0])
 
 
@@ -118,7 +119,7 @@ class Batch:
         unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]) * free)
         unknowns.add("world.shift", np.full(3, 100.0) * free)
         for unit in self.units:
-            names = ["bias", "scale", "turn"]
+            names = ["bias", "scale", "shear", "turn"]
             if unit.force_known.any():
                 names += ["accel_bias", "accel_turn", "lever"]
             if unit.name == "ins":
@@ -283,8 +284,8 @@ def place_on_grid(unit: Unit, track: ImuTrack, path: Path) -> None:
 def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array) -> Unit:
     """A unit with nothing estimated yet but its gyro's bias."""
     values = {
-        "bias": bias.copy(), "scale": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1), "accel_bias": np.zeros(3),
-        "accel_turn": np.zeros(3), "lever": lever.copy(),
+        "bias": bias.copy(), "scale": np.zeros(3), "shear": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1),
+        "accel_bias": np.zeros(3), "accel_turn": np.zeros(3), "lever": lever.copy(),
     }  # fmt: skip
     none = np.zeros((0, 3))
     unit = Unit(

@@ -85,7 +85,9 @@ def unknowns_of(*names: str) -> Unknowns:
     return unknowns
 
 
-UNIT_NAMES = tuple(f"ins.{name}" for name in ("bias", "scale", "turn", "accel_bias", "accel_turn", "lever", "delay"))
+UNIT_NAMES = tuple(
+    f"ins.{name}" for name in ("bias", "scale", "shear", "turn", "accel_bias", "accel_turn", "lever", "delay")
+)
 
 
 def changed_unit(unit: Unit, track: ImuTrack, path: Path, name: str, change: Array) -> Unit:
@@ -152,7 +154,7 @@ def test_what_a_gyro_says_is_linear_as_stated(path: Path, unit: Unit) -> None:
     track = samples(400.0, LEVER)
     dense = factor.matrix.toarray()
     # by the slice's whole turn at once: it is up to 0.09 rad, and by so much the second order may differ
-    for name, size in (("bias", 1e-4), ("scale", 1e-4), ("turn", 1e-4), ("delay", 1e-3)):
+    for name, size in (("bias", 1e-4), ("scale", 1e-4), ("shear", 1e-4), ("turn", 1e-4), ("delay", 1e-3)):
         where = unknowns.names[f"ins.{name}"]
         columns = []
         for c in range(where.stop - where.start):
@@ -165,6 +167,27 @@ def test_what_a_gyro_says_is_linear_as_stated(path: Path, unit: Unit) -> None:
         assert_close(dense[:, where], np.array(columns).T, 0.09)
     for name in ("world.turn", "world.shift", "ins.accel_bias", "ins.lever"):
         assert not dense[:, unknowns.names[name]].any()
+
+
+def test_vibration_makes_no_delay(path: Path) -> None:
+    """A gyro that does not follow the vibration of the path: on average over its phases the rows ask for no delay.
+
+    The yardstick is what one phase of the line at 23 Hz asks for alone.
+    """
+    seconds = np.arange(INTERVALS * STEPS + 1) * STEP_S
+    track = samples(400.0, np.zeros(3))
+    pulls = []
+    for phase in np.linspace(0.0, 2 * np.pi, 40, endpoint=False):
+        shake = np.zeros((len(seconds), 3))
+        shake[:, 0] = np.deg2rad(0.05) * np.sin(2 * np.pi * 23.0 * seconds + phase)
+        shaken = Path(START_NS, frames.quat_multiply(attitude_at(seconds), frames.quat_exp(shake)), path.position_m)
+        made = make_unit("ins", track, shaken, np.zeros(3), np.zeros(3))
+        unknowns = unknowns_of(*UNIT_NAMES)
+        factor = turn_factor(made, shaken, unknowns)
+        column = factor.matrix[:, unknowns.names["ins.delay"]].toarray()[:, 0]
+        pulls.append(-float(column @ factor.residual) / float(column @ column))
+    assert np.std(pulls) > 1e-4  # one phase alone: a tenth of a millisecond and more
+    assert abs(np.mean(pulls)) < 2e-5
 
 
 def test_what_an_accelerometer_says_is_linear_as_stated(path: Path, unit: Unit) -> None:
