@@ -141,7 +141,7 @@ class Batch:
         unknowns = self.unknowns()
         rows = rows_of(self.clusters, self.path, voxel_m, self.most, cut)
         factors = self.factors(unknowns, weigh)
-        linear = problem(rows, factors, unknowns, DEFLATION)
+        linear = problem(rows, factors, unknowns, DEFLATION, self.path)
         x, steps = linear.solve(-linear.gradient)
         cost, used = rows.cost()
         self.log.append(
@@ -252,7 +252,7 @@ class Posterior:
             right[: self.unknowns.path_size] = self.problem.rows.noise(rng) / np.sqrt(DEFLATION)
             for factor in self.factors:
                 right += factor.matrix.T @ (rng.standard_normal(len(factor.sigma)) / factor.sigma)
-            found[i], _ = self.problem.solve(right, 1e-2)
+            found[i], _ = self.problem.solve(right, 0.05)
         return found
 
     def covariance(self, names: Sequence[str]) -> Array:
@@ -262,7 +262,7 @@ class Posterior:
         for i, place in enumerate(places):
             right = np.zeros(self.unknowns.size)
             right[place] = 1.0
-            columns[i] = self.problem.solve(right, 1e-5)[0][places]
+            columns[i] = self.problem.solve(right)[0][places]
         return np.asarray(0.5 * (columns + columns.T))
 
 

@@ -15,7 +15,7 @@ from numba import njit, prange
 from groundproc.adjustment.odometry import GROUND, observable
 from groundproc.adjustment.rotations import flattest, mat_of_quat
 from groundproc.adjustment.scans import STEP_NS, STEPS, spread, voxel_key
-from groundproc.adjustment.spline import GRAM, Path, basis
+from groundproc.adjustment.spline import Path, basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -135,20 +135,19 @@ class Rows:
         _gradient(self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.inverse, drawn, out)
         return np.asarray(out.sum(axis=0))
 
-    def blocks(self) -> Array:
-        """Information on the pose of each interval were the planes known, shape (intervals, 6, 6)."""
-        out = np.zeros((self.intervals, 6, 6))
-        _blocks(self.knot, self.jacobian, self.weight, out)
+    def band(self) -> Array:
+        """The normal matrix were the planes known: of each interval's four coefficients, shape (intervals, 4, 4, 6, 6)."""
+        out = np.zeros((self.intervals, 4, 4, 6, 6))
+        _band(self.knot, self.weights, self.jacobian, self.weight, out)
+        for a in range(6):
+            out[:, :, :, a, :a] = out[:, :, :, :a, a]
+        for i in range(4):
+            out[:, i, :i] = out[:, :i, i]
         return out
 
     def cost(self) -> tuple[float, int]:
         """Weighted sum of squares left after the planes, and the rows that count."""
         return _cost(self.first, self.plane, self.weight, self.inverse, self.residual_m), int((self.weight > 0).sum())
-
-
-def band_of(blocks: Array) -> Array:
-    """Blocks of intervals as seen by their four coefficients, shape (intervals, 4, 4, 6, 6)."""
-    return np.asarray(np.einsum("ij,nab->nijab", GRAM, blocks))
 
 
 def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool) -> Rows:
@@ -567,6 +566,21 @@ def _blocks(knot: Any, jacobian: Any, weight: Any, out: Any) -> None:
             wa = weight[i] * jacobian[i, a]
             for b in range(6):
                 out[k, a, b] += wa * jacobian[i, b]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _band(knot: Any, weights: Any, jacobian: Any, weight: Any, out: Any) -> None:
+    """The upper triangles of the blocks of each interval."""
+    for n in range(len(knot)):
+        block = out[knot[n]]
+        for a in range(6):
+            y = weight[n] * jacobian[n, a]
+            for b in range(a, 6):
+                z = y * jacobian[n, b]
+                for i in range(4):
+                    u = z * weights[n, i]
+                    for j in range(i, 4):
+                        block[i, j, a, b] += u * weights[n, j]
 
 
 @njit(cache=True, nogil=True)

@@ -18,8 +18,6 @@ from groundproc.adjustment.scans import STEP_NS, STEPS
 Array = npt.NDArray[np.float64]
 
 DEGREE: Final = 3
-GRAM: Final = np.array([[20, 129, 60, 1], [129, 1188, 933, 60], [60, 933, 1188, 129], [1, 60, 129, 20]]) / 5040.0
-"""Integrals of products of two weights over an interval, shape (4, 4)."""
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -5,9 +5,9 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from groundproc.adjustment.planes import TILT_PRIOR, Clusters, Rows, band_of, rows_of
+from groundproc.adjustment.planes import TILT_PRIOR, Clusters, Rows, rows_of
 from groundproc.adjustment.scans import STEP_NS, STEPS
-from groundproc.adjustment.spline import GRAM, Path, basis
+from groundproc.adjustment.spline import Path, basis
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 8
@@ -123,13 +123,13 @@ def test_noise_has_the_normal_matrix_for_its_covariance(rows: Rows) -> None:
     assert np.abs(found.mean(axis=0) / np.sqrt(np.maximum(np.diag(normal), 1.0))).max() < 4.5 / np.sqrt(draws) + 0.05
 
 
-def test_the_preconditioners_band_is_the_information_spread_evenly(rows: Rows) -> None:
-    """Were every row's weights those of an instant drawn evenly from its interval, this would be the normal matrix with planes known."""
-    blocks = rows.blocks()
-    for k in range(INTERVALS):
-        j = rows.jacobian[rows.knot == k].astype(float)
-        np.testing.assert_allclose(blocks[k], j.T @ (rows.weight[rows.knot == k][:, None] * j), rtol=1e-6, atol=1e-3)
-    np.testing.assert_allclose(band_of(blocks)[2, 1, 3], GRAM[1, 3] * blocks[2])
+def test_the_band_is_the_normal_matrix_with_the_planes_known(rows: Rows) -> None:
+    by_path, _, _ = dense(rows)
+    band, expected = np.zeros((SIZE, SIZE)), by_path.T @ (rows.weight[:, None] * by_path)
+    for k, blocks in enumerate(rows.band()):
+        at = slice(6 * k, 6 * k + 24)
+        band[at, at] += blocks.transpose(0, 2, 1, 3).reshape(24, 24)
+    np.testing.assert_allclose(band, expected, atol=1e-9 * expected.max())
 
 
 def test_rows_are_the_distances_from_the_planes_and_their_derivatives(path: Path, rows: Rows) -> None:
@@ -192,7 +192,7 @@ def test_over_level_ground_alone_nothing_holds_place_or_heading(path: Path) -> N
     clusters.xyz_m[:] = np.einsum("nji,nj->ni", mats, world - place)
     rows = rows_of(clusters, path, VOXEL_M, 10**6, cut=False)
     assert len(rows) > 1000
-    for k, block in enumerate(rows.blocks()):
+    for k, block in enumerate(rows.band().sum(axis=(1, 2))):
         mat = frames.mat_from_quat(path.quat)[k * STEPS + STEPS // 2]
         # about the vertical through the sensor, and along east and north
         for freedom in (np.concatenate([mat.T @ [0, 0, 1], np.zeros(3)]), np.eye(6)[3], np.eye(6)[4]):

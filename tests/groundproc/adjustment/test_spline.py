@@ -2,14 +2,12 @@
 
 import numpy as np
 import numpy.typing as npt
-import pytest
-from scipy.integrate import quad
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from flightlog import frames
 from groundproc.adjustment.scans import STEP_NS, STEPS
-from groundproc.adjustment.spline import GRAM, Path, basis, integrated, smooth_path
+from groundproc.adjustment.spline import Path, basis, integrated, smooth_path
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 7
@@ -32,13 +30,6 @@ def test_the_weights_are_scipys() -> None:
     coefficients = np.eye(4)
     for u in np.linspace(0.0, 1.0, 21):
         np.testing.assert_allclose(basis(float(u)), scipys(coefficients)(u), atol=1e-15)
-
-
-def test_the_gram_matrix_is_the_integral_of_products() -> None:
-    for i in range(4):
-        for j in range(4):
-            integral = quad(lambda u, i=i, j=j: basis(u)[i] * basis(u)[j], 0.0, 1.0, epsabs=1e-13)[0]
-            assert GRAM[i, j] == pytest.approx(integral, abs=1e-13)
 
 
 def test_a_path_is_turned_in_the_body_and_moved_by_the_spline() -> None:
