@@ -14,6 +14,7 @@ from typing import Any
 from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
 from groundproc import geodesy
+from groundproc.calibration.lasers import ESTIMATE
 from groundproc.cloud import write_cloud
 from groundproc.files import made_folder, written_aside
 from groundproc.flight import read_flight
@@ -23,7 +24,7 @@ from groundproc.quality import describe
 from groundproc.survey import Survey
 from groundproc.timeline import legs
 from groundproc.trajectory import methods
-from groundproc.trajectory.method import Estimate, Progress, gather
+from groundproc.trajectory.method import Estimate, Progress, chosen_table, gather
 from groundproc.trajectory.table import read_trajectory, write_trajectory
 
 
@@ -50,8 +51,11 @@ def process(
     """
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)  # a wrong code is said before the work, not after
+    lasers = chosen_table(survey)
     if poses is None:
         methods.check(survey)
+    elif survey.lasers == ESTIMATE:
+        raise UsageError("lasers: estimate given, but with a trajectory from elsewhere nothing is estimated")
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder))
         readers = [stack.enter_context(LogReader(path)) for path in logs]
@@ -62,7 +66,7 @@ def process(
         if poses is None:
             made = methods.estimate(gather(readers, flight, timeline, mount, survey), progress)
         else:
-            made = Estimate(read_trajectory(poses), mount, f"as {poses} has them", method="outside")
+            made = Estimate(read_trajectory(poses), mount, f"as {poses} has them", lasers, method="outside")
         trajectory = made.trajectory
         frame = trajectory.frame
         code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)

@@ -37,12 +37,18 @@ class Survey:
     dynamic: DynamicOptions = option(DynamicOptions, "method dynamic: trims once per revolution of the scanner")
     compass: str | None = option(
         None,
-        "method dynamic: a compass model to begin with, from `swath compass`, looked for beside this file; null: none",
+        "method dynamic: a compass model to begin with, from `swath calibrate` or `swath compass`, looked for beside this file; "
+        "null: none",
     )
     positions: str | None = option(
         None,
         "methods adjusted and filtered: a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), looked for "
         "beside this file; null: none",
+    )
+    lasers: str | None = option(
+        None,
+        "corrections of the 32 lasers: a file from `swath calibrate --lasers`, looked for beside this one; estimate: method adjusted "
+        "finds them on this flight; null: the manual's table",
     )
     pose_grid_ms: float | None = option(
         None,

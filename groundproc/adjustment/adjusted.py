@@ -20,13 +20,25 @@ from groundproc.adjustment.anchors import Attitudes, Positions, within
 from groundproc.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
 from groundproc.adjustment.beginning import BEGINNING, redo_beginning
 from groundproc.adjustment.factors import H
+from groundproc.adjustment.lasers import Corrections
 from groundproc.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
 from groundproc.adjustment.outside import DELAY, outside_track
 from groundproc.adjustment.scans import STEP_NS, STEPS, Slice, slices
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track, Tracker, grid_ns, tracked
-from groundproc.adjustment.windows import OVERLAP, UNSEEN, WINDOW, Sources, Window, adjust_window, joined_path
+from groundproc.adjustment.windows import (
+    OVERLAP,
+    UNSEEN,
+    WINDOW,
+    Sources,
+    Window,
+    adjust_window,
+    corrections_over,
+    joined_path,
+)
 from groundproc.autopilot import Boot
+from groundproc.calibration.lasers import ESTIMATE
+from groundproc.decode import LaserTable
 from groundproc.geodesy import LocalFrame
 from groundproc.timeline import Leg
 from groundproc.trajectory import ins
@@ -75,14 +87,19 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     main = max(made, key=lambda run: len(run.path.quat))
     mount = main.mount(given.mount)
     warnings = [w for run in made for w in run.warnings()] + [str(reason) for reason in reasons]
+    corrections = main.corrections()
     trajectory = joined([run.trajectory(given, mount) if not run.is_blind() else own_part(start, run) for run in made])
     return Estimate(
         trajectory,
         mount,
         main.SIGMA_SOURCE,
+        main.lasers(given.lasers),
         report=main.report(given.mount),
         warning="; ".join(warnings),
-        products=(functools.partial(_draw, main, given, trajectory),),
+        products=(
+            functools.partial(_draw, main, given, trajectory),
+            *(() if corrections is None else (functools.partial(_draw_lasers, corrections),)),
+        ),
     )
 
 
@@ -90,6 +107,12 @@ def _draw(run: "Run | CausalRun", given: Given, trajectory: Trajectory, folder: 
     from groundproc.products.adjustment_plot import draw_adjustment, sheet_of
 
     draw_adjustment(folder / "adjustment.png", sheet_of(run, given, trajectory))
+
+
+def _draw_lasers(corrections: Corrections, folder: pathlib.Path) -> None:
+    from groundproc.products.laser_plot import draw_lasers
+
+    draw_lasers(folder / "lasers.png", corrections)
 
 
 @dataclass(slots=True)
@@ -140,6 +163,16 @@ class Run:
         return nominal.with_lidar(
             yaw_deg=(180.0 - heading) % 360.0 - 180.0, pitch_deg=pitch, roll_deg=roll, position_m=(x, y, z)
         )
+
+    def corrections(self) -> Corrections | None:
+        """Those of the lasers; None where they were not asked for."""
+        told = corrections_over(self.windows)
+        return None if told is None else Corrections(*told)
+
+    def lasers(self, nominal: LaserTable) -> LaserTable:
+        """The lasers as estimated, or as they were given."""
+        found = self.corrections()
+        return nominal if found is None else found.file().table()
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""
@@ -212,6 +245,7 @@ class Run:
         """What stands in quality.json."""
         values: dict[str, Any] = {}
         priors = self.priors()
+        corrections = self.corrections()
         for key, (value, sigma) in self.estimates().items():
             name = key.rsplit(".", 1)[-1]
             scale = np.rad2deg(1.0) if name in ("bias", "turn", "accel_turn", "compass") else 1.0
@@ -240,6 +274,7 @@ class Run:
                 }
                 for outside in self.sources.outside
             ],
+            **({} if corrections is None else {"lasers": corrections.report()}),
             "mount_change": {
                 "yaw_pitch_roll_deg": [
                     mount.lidar.yaw_deg - nominal.lidar.yaw_deg,
@@ -312,6 +347,13 @@ class CausalRun:
         )
         attitude = np.hypot(attitude, ATTITUDE_SIGMA_RAD * np.array([1.0, 1.0, 2.5]))
         return of_ins(self.path, self.motion, given.frame, mount, np.hypot(position, self.start_sigma_m), attitude)
+
+    def corrections(self) -> None:
+        """The lasers are taken as they are given."""
+
+    def lasers(self, nominal: LaserTable) -> LaserTable:
+        """As they were given."""
+        return nominal
 
     def is_blind(self) -> bool:
         """It is what it is."""
@@ -391,6 +433,7 @@ def adjust_run(
         lever,
         exact,
         [outside_track(fixes, mat, lever, legs[0].utc) for fixes in surveyed(given)],
+        given.survey.lasers == ESTIMATE,
     )
     tracker = Tracker(
         motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
@@ -399,7 +442,7 @@ def adjust_run(
     windows: list[Window] = []
     begin = 0
     early: list[Slice] = []
-    for piece in slices(given, motion.start_ns, progress):
+    for piece in slices(given, motion.start_ns, progress, sources.lasers_apart):
         tracker.feed(piece)
         if tracker.track is None:
             continue

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
+from groundproc.adjustment import lasers
 from groundproc.adjustment.anchors import (
     COMPASS_TERMS,
     Attitudes,
@@ -44,6 +45,8 @@ SETTLED_M: Final = 0.003
 DEFLATION: Final = 4.0
 """The lidar's information is divided by this: errors of neighbouring clusters are not independent. Checked by the share of errors within
 two sigmas (tests)."""
+EXACT: Final = 1e-8
+"""Covariances are exact to this share of the prior's variance; of what is known ten thousand times better, in variance, to 1e-4."""
 DRAWS: Final = 12
 """Draws from the posterior that the sigmas are from: right to a fifth."""
 
@@ -85,6 +88,8 @@ class Batch:
         Positions and poses of another program.
     outside_delay_s : ndarray, shape (1,)
         Of these.
+    corrections : ndarray, shape (64,)
+        Of the lasers, so far; they stay 0 where the clusters have none.
     """
 
     path: Path
@@ -100,6 +105,7 @@ class Batch:
     tie: Tie | None = None
     outside: Sequence[Outside] = ()
     outside_delay_s: Array = field(default_factory=lambda: np.zeros(1))
+    corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
     log: list[dict[str, float]] = field(default_factory=list)
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
@@ -115,6 +121,9 @@ class Batch:
     def unknowns(self) -> Unknowns:
         """The unknowns that this flight's instruments have."""
         unknowns = Unknowns(self.path.intervals)
+        if self.clusters.laser is not None:
+            for name, sigma in zip(lasers.NAMES, np.split(lasers.PRIOR, len(lasers.NAMES)), strict=True):
+                unknowns.add(name, sigma)
         free = 1.0 if self.tie is None else 1e-6
         unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]) * free)
         unknowns.add("world.shift", np.full(3, 100.0) * free)
@@ -161,6 +170,7 @@ class Batch:
         """Everything but the lidar."""
         found: list[Factor] = []
         values: dict[str, Array] = {"compass": self.compass, DELAY: self.outside_delay_s}
+        values |= dict(zip(lasers.NAMES, np.split(self.corrections, len(lasers.NAMES)), strict=True))
         for unit in self.units:
             found += self._inertial(unit, unknowns, weigh)
             values |= {f"{unit.name}.{name}": value for name, value in unit.values.items()}
@@ -203,6 +213,10 @@ class Batch:
     def take(self, unknowns: Unknowns, x: Array) -> None:
         """Put a solution in."""
         part = {name: x[place] for name, place in unknowns.names.items()}
+        if self.clusters.laser is not None:
+            offsets = np.concatenate([part[name] for name in lasers.NAMES])
+            self.clusters.xyz_m = lasers.shifted(self.clusters.xyz_m, self.clusters.laser, offsets)
+            self.corrections = self.corrections + offsets
         path = self.path.corrected(x[: unknowns.path_size].reshape(-1, 6))
         self.path = path.turned(turned(part["world.turn"]), part["world.shift"])
         self.compass = self.compass + part["compass"]
@@ -249,7 +263,7 @@ class Posterior:
         found = np.empty((count, self.unknowns.size))
         for i in range(count):
             right = np.zeros(self.unknowns.size)
-            right[: self.unknowns.path_size] = self.problem.rows.noise(rng) / np.sqrt(DEFLATION)
+            right[: self.problem.rows.size] = self.problem.rows.noise(rng) / np.sqrt(DEFLATION)
             for factor in self.factors:
                 right += factor.matrix.T @ (rng.standard_normal(len(factor.sigma)) / factor.sigma)
             found[i], _ = self.problem.solve(right, 0.05)
@@ -258,12 +272,23 @@ class Posterior:
     def covariance(self, names: Sequence[str]) -> Array:
         """Covariance of some globals, exactly, shape (m, m): the inverse's columns."""
         places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
+        prior = np.concatenate([self.unknowns.sigma[n] for n in names])
         columns = np.empty((len(places), len(places)))
         for i, place in enumerate(places):
             right = np.zeros(self.unknowns.size)
-            right[place] = 1.0
-            columns[i] = self.problem.solve(right)[0][places]
+            # what is gained is then the variance, in the prior's
+            right[place] = 1.0 / prior[i]
+            columns[i] = self.problem.solve(right, EXACT)[0][places] * prior[i]
         return np.asarray(0.5 * (columns + columns.T))
+
+
+def joined(values: Sequence[Array], covariances: Sequence[Array], prior_sigma: Array) -> tuple[Array, Array]:
+    """Weighted mean of estimates that all hold the same prior about zero, and its covariance: the prior is counted once."""
+    information = [np.linalg.inv(covariance) for covariance in covariances]
+    total = sum(information[1:], information[0]) - (len(information) - 1) * np.diag(prior_sigma**-2.0)
+    right = sum((i @ v for i, v in zip(information, values, strict=True)), np.zeros(len(prior_sigma)))
+    covariance: Array = np.asarray(np.linalg.inv(total), np.float64)
+    return covariance @ right, covariance
 
 
 def turned(vector: Array) -> Array:

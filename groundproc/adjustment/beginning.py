@@ -65,7 +65,8 @@ def redo_beginning(track: Track, motion: Motion, early: Sequence[Slice], state: 
         while odometry.number < count - 1 - k:  # nothing was seen
             odometry.propagate(odometry.number)
             found[count - odometry.number] = copy.deepcopy(odometry.state), None
-        step = odometry.step(Slice(count - 1 - k, end_ns - piece.time_ns[::-1], piece.xyz_m[::-1].copy()))
+        laser = None if piece.laser is None else piece.laser[::-1].copy()
+        step = odometry.step(Slice(count - 1 - k, end_ns - piece.time_ns[::-1], piece.xyz_m[::-1].copy(), laser))
         found[k] = copy.deepcopy(odometry.state), step
     while odometry.number < count:
         odometry.propagate(odometry.number)

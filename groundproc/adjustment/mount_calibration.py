@@ -5,7 +5,7 @@ counted once. What the flights could not tell stays as it was.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,13 +15,21 @@ from scipy.stats import chi2
 
 from flightlog import frames
 from flightlog.mount import Mount
-from groundproc.adjustment.batch import PRIORS, turned
-from groundproc.adjustment.windows import UNSEEN, Window
+from groundproc.adjustment import lasers
+from groundproc.adjustment.batch import COMPASS_PRIOR, PRIORS, joined, turned
+from groundproc.adjustment.lasers import Corrections
+from groundproc.adjustment.scans import STEPS
+from groundproc.adjustment.windows import UNSEEN, Window, corrections_over
+from groundproc.calibration.compass import BINS, CompassCurve, curve_of_errors, sector_of
 
 Array = npt.NDArray[np.float64]
 
 SHARED: Final = ("ins.turn", "ins.lever")
 """What stays the same from flight to flight, in the order of the covariance: misalignment [rad] and lever arm [m], sensor frame."""
+COMPASS: Final = ("compass",)
+"""So does its curve, as long as the airframe carries the same iron."""
+FEWEST: Final = 10
+"""Slices, a second, that a heading must have been flown for to count as seen."""
 KNOWN: Final = 0.5
 """A parameter counts as found where its sigma is below this share of what was known before."""
 DOUBTFUL: Final = 0.001
@@ -43,7 +51,14 @@ class FlightResult:
         Delay of the autopilot's gyro beyond what the synchronisation found.
     offset_s : float
         Autopilot time less lidar time.
-    compass_rad, sigma_compass_rad : ndarray, shape (5,)
+    compass_rad : ndarray, shape (5,)
+        Stated less true heading: constant, sine and cosine of the true heading, and of twice that.
+    compass_covariance : ndarray, shape (5, 5)
+        With the prior in it.
+    headings : ndarray of bool, shape (BINS,)
+        Sectors of the stated heading that were flown.
+    lasers : tuple of (ndarray, ndarray), optional
+        Corrections, shape (64,), and their covariance, where they were asked for.
     seconds : float
     warning : str
     """
@@ -55,7 +70,9 @@ class FlightResult:
     sigma_delay_s: float
     offset_s: float
     compass_rad: Array
-    sigma_compass_rad: Array
+    compass_covariance: Array
+    headings: npt.NDArray[np.bool_]
+    lasers: tuple[Array, Array] | None
     seconds: float
     warning: str
 
@@ -74,6 +91,10 @@ class MountCalibration:
     chi_square : float
     freedom : int
         Degrees of freedom of that.
+    compass : CompassCurve
+    headings : ndarray of bool, shape (BINS,)
+        Sectors of heading that any flight has flown.
+    lasers : Corrections, optional
     """
 
     flights: Sequence[FlightResult]
@@ -82,6 +103,25 @@ class MountCalibration:
     found: npt.NDArray[np.bool_]
     chi_square: float
     freedom: int
+    compass: CompassCurve
+    headings: npt.NDArray[np.bool_]
+    lasers: Corrections | None = None
+
+    @property
+    def compass_found(self) -> bool:
+        """Whether the compass curve is known better than before at the headings that were flown."""
+        seen, _ = self.compass_sigma_deg()
+        before = np.rad2deg(np.sqrt(COMPASS_PRIOR[0] ** 2 + COMPASS_PRIOR[1] ** 2 + COMPASS_PRIOR[3] ** 2))
+        return seen < KNOWN * float(before)
+
+    def compass_sigma_deg(self) -> tuple[float, float]:
+        """Largest sigma of the compass curve where it was flown, and elsewhere; not-a-number where there is no such heading."""
+        middle = (np.arange(BINS) + 0.5) * 2.0 * np.pi / BINS
+        sigma = np.rad2deg(self.compass.sigma_rad(middle))
+        seen, unseen = (
+            float(sigma[part].max()) if part.any() else float("nan") for part in (self.headings, ~self.headings)
+        )
+        return seen, unseen
 
     @property
     def agree(self) -> bool:
@@ -127,6 +167,16 @@ class MountCalibration:
                 "roll_deg": mount.lidar.roll_deg,
                 "position_m": list(mount.lidar.position_m),
             },
+            "compass": {
+                "found": self.compass_found,
+                "coefficients_deg": list(self.compass.coefficients_deg),
+                "covariance_deg2": [list(row) for row in self.compass.covariance_deg2],
+                "scatter_deg": self.compass.scatter_deg,
+                "headings_seen_deg": (np.flatnonzero(self.headings) * 360.0 / BINS).tolist(),
+                "sector_deg": 360.0 / BINS,
+                "largest_sigma_deg": dict(zip(("seen", "elsewhere"), self.compass_sigma_deg(), strict=True)),
+            },
+            **({} if self.lasers is None else {"lasers": self.lasers.report()}),
             "flights": [
                 {
                     "log": flight.name,
@@ -137,7 +187,8 @@ class MountCalibration:
                     "sigma_delay_ms": flight.sigma_delay_s * 1e3,
                     "offset_s": flight.offset_s,
                     "compass_deg": np.rad2deg(flight.compass_rad).tolist(),
-                    "sigma_compass_deg": np.rad2deg(flight.sigma_compass_rad).tolist(),
+                    "sigma_compass_deg": np.rad2deg(np.sqrt(np.diag(flight.compass_covariance))).tolist(),
+                    "headings_seen": float(flight.headings.mean()),
                     "warning": flight.warning,
                 }
                 for flight in self.flights
@@ -154,13 +205,18 @@ def flight_result(
         return None
     to_ins = -nominal.mat_ins_lidar().T @ nominal.lidar_position_m()
     values = [_shared(window.values, to_ins) for window in exact]
-    value, covariance = joined(values, [window.covariance for window in exact if window.covariance is not None])
+    covariances = [window.covariance for window in exact if window.covariance is not None]
+    curves = [window.values["compass"][0] for window in exact]
+    size = len(PRIOR)
+    value, covariance = joined(values, [square[:size, :size] for square in covariances], PRIOR)
+    curve, curve_covariance = joined(curves, [square[size:, size:] for square in covariances], COMPASS_PRIOR)
+    if len(exact) > 1:  # later windows have the first one's north, error and all
+        curve_covariance[0, 0] += covariances[0][size, size]
     delays = [window.values["ins.delay"] for window in exact]
     best = min(delays, key=lambda pair: float(pair[1][0]))
-    compass = min((window.values["compass"] for window in exact), key=lambda pair: float(pair[1].sum()))
     return FlightResult(
-        path.name, value, covariance, float(best[0][0]), float(best[1][0]), offset_s, compass[0], compass[1],
-        sum(window.own for window in windows) * 0.1, warning,
+        path.name, value, covariance, float(best[0][0]), float(best[1][0]), offset_s, curve, curve_covariance,
+        headings_of(windows, nominal, curve), corrections_over(windows), sum(window.own for window in windows) * 0.1, warning,
     )  # fmt: skip
 
 
@@ -168,20 +224,42 @@ def _shared(values: Mapping[str, tuple[Array, Array]], to_ins: Array) -> Array:
     return np.concatenate([values["ins.turn"][0], values["ins.lever"][0] - to_ins])
 
 
-def joined(values: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:
-    """Weighted mean of estimates that all hold the same prior: it is counted once."""
-    prior = np.diag(np.repeat([PRIORS[name] ** -2.0 for name in SHARED], 3))
-    information = [np.linalg.inv(covariance) for covariance in covariances]
-    total = sum(information[1:], information[0]) - (len(information) - 1) * prior
-    right = sum((i @ v for i, v in zip(information, values, strict=True)), np.zeros(6))
-    covariance = np.linalg.inv(total)
-    return covariance @ right, covariance
+def headings_of(windows: Sequence[Window], nominal: Mount, curve: Array) -> npt.NDArray[np.bool_]:
+    """Sectors of the heading as the autopilot stated it that were flown, shape (BINS,)."""
+    quat = np.concatenate([window.path.quat[: window.own * STEPS : STEPS] for window in windows])
+    true = frames.attitude_of(frames.mat_from_quat(quat) @ nominal.mat_ins_lidar().T)[0]
+    terms = np.stack([np.ones_like(true), np.sin(true), np.cos(true), np.sin(2 * true), np.cos(2 * true)], axis=1)
+    return np.bincount(sector_of(true + terms @ curve), minlength=BINS) >= FEWEST
+
+
+PRIOR: Final = np.repeat([PRIORS[name] for name in SHARED], 3)
 
 
 def calibrate(flights: Sequence[FlightResult]) -> MountCalibration:
     """Join flights."""
-    value, covariance = joined([f.value for f in flights], [f.covariance for f in flights])
-    prior = np.repeat([PRIORS[name] for name in SHARED], 3)
+    value, covariance = joined([f.value for f in flights], [f.covariance for f in flights], PRIOR)
     chi_square = sum(float((f.value - value) @ np.linalg.solve(f.covariance, f.value - value)) for f in flights)
-    found = np.sqrt(np.diag(covariance)) < KNOWN * prior
-    return MountCalibration(flights, value, covariance, found, chi_square, 6 * (len(flights) - 1))
+    found = np.sqrt(np.diag(covariance)) < KNOWN * PRIOR
+    curve, curve_covariance = joined(
+        [f.compass_rad for f in flights], [f.compass_covariance for f in flights], COMPASS_PRIOR
+    )
+    headings = np.any([f.headings for f in flights], axis=0)
+    compass = curve_of_errors(curve, curve_covariance, _scatter_deg(flights, curve), len(flights), headings)
+    made = MountCalibration(
+        flights, value, covariance, found, chi_square, len(PRIOR) * (len(flights) - 1), compass, headings
+    )
+    told = [f.lasers for f in flights if f.lasers is not None]
+    if not told:
+        return made
+    return replace(
+        made, lasers=Corrections(*joined([o for o, _ in told], [square for _, square in told], lasers.PRIOR))
+    )
+
+
+def _scatter_deg(flights: Sequence[FlightResult], curve: Array) -> float:
+    """How far the flights' own compass curves lie from the common one, RMS over the headings that each has flown."""
+    middle = (np.arange(BINS) + 0.5) * 2.0 * np.pi / BINS
+    terms = np.stack([np.ones(BINS), np.sin(middle), np.cos(middle), np.sin(2 * middle), np.cos(2 * middle)], axis=1)
+    off = [(terms @ (f.compass_rad - curve))[f.headings] for f in flights]
+    squares = np.concatenate([np.zeros(0), *off]) ** 2
+    return float(np.rad2deg(np.sqrt(squares.mean()))) if len(squares) and len(flights) > 1 else 0.0

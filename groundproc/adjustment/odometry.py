@@ -73,10 +73,11 @@ class Step:
     sigma : ndarray, shape (6,)
         Of attitude [rad] and position [m].
     clusters : ndarray of CLUSTER_DTYPE
+        Of one laser each where the slice has them told apart.
     world_m : ndarray, shape (m, 3)
         Where the corrected pose places them.
-    matched : int
-        Clusters that found a plane.
+    seen, matched : int
+        Clusters of all lasers, and those that found a plane.
     residual_m : float
         RMS distance from it.
     """
@@ -89,6 +90,7 @@ class Step:
     sigma: Array
     clusters: npt.NDArray[np.void]
     world_m: Array
+    seen: int
     matched: int
     residual_m: float
 
@@ -163,6 +165,7 @@ class Odometry:
         # in the body at the slice's end, where the prediction between the instants stands
         mat = np.empty((3, 3))
         mat_of_quat(s.quat, mat)
+        before = mat.copy()
         body = (world - s.position_m) @ mat
         if self.map.count:
             matched, residual, s.covariance = _update(
@@ -172,11 +175,16 @@ class Odometry:
             mat_of_quat(s.quat, mat)
             world = body @ mat.T + s.position_m
         self.map.insert(world, clusters, self.MOST)
+        seen = len(clusters)
+        if piece.laser is not None:
+            # these would weigh more in the filter, for each has a surface's roughness of its own
+            clusters, world = self._cluster(piece, start_ns, quats, positions, apart=True)
+            world = (world - positions[-1]) @ before @ mat.T + s.position_m
         if piece.number % 50 == 0:
             self.map.forget_beyond(s.position_m, self.REACH_M)
         return Step(
             piece.number, s.quat.copy(), s.position_m.copy(), s.velocity_m_s.copy(), s.gyro_bias_rad_s.copy(),
-            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, matched, residual,
+            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, seen, matched, residual,
         )  # fmt: skip
 
     def position_fix(self, position_m: Array, sigma_m: Array) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from groundproc.adjustment.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
 from groundproc.adjustment.odometry import GROUND, observable
 from groundproc.adjustment.rotations import flattest, mat_of_quat
 from groundproc.adjustment.scans import STEP_NS, STEPS, spread, voxel_key
@@ -44,12 +45,15 @@ class Clusters:
     xyz_m : ndarray of float32, shape (n, 3)
     scatter_m2 : ndarray of float32, shape (n, 6)
     count : ndarray of int32, shape (n,)
+    laser : ndarray of int32, shape (n,), optional
+        Given where the corrections of the single lasers are unknowns too.
     """
 
     time_ns: Ints
     xyz_m: npt.NDArray[np.float32]
     scatter_m2: npt.NDArray[np.float32]
     count: npt.NDArray[np.int32]
+    laser: npt.NDArray[np.int32] | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -79,6 +83,8 @@ class Rows:
         Inverse of each plane's normal matrix: 00 01 02 11 12 22.
     cluster : ndarray of int64, shape (n,)
         Where each row's cluster stands.
+    lasers : LaserColumns, optional
+        By the corrections of the lasers, whose unknowns follow those of the path.
     """
 
     first: Ints
@@ -91,12 +97,32 @@ class Rows:
     inverse: Array
     cluster: Ints
     intervals: int
+    lasers: LaserColumns | None = None
 
     def __len__(self) -> int:
         return len(self.knot)
 
+    @property
+    def path_size(self) -> int:
+        """Unknowns of the path."""
+        return (self.intervals + 3) * 6
+
+    @property
+    def size(self) -> int:
+        """Unknowns of the path and of the lasers."""
+        return self.path_size + (0 if self.lasers is None else UNKNOWNS)
+
     def apply(self, vector: Array) -> Array:
-        """The normal matrix of the lidar times a vector, shape ((intervals + 3) * 6,)."""
+        """The normal matrix of the lidar times a vector, shape (size,)."""
+        path = vector[: self.path_size]
+        if self.lasers is None:
+            return self._apply(path)
+        lasers, corrections = self.lasers, vector[self.path_size :]
+        return np.concatenate(
+            [self._apply(path) + corrections @ lasers.border, lasers.border @ path + lasers.corner @ corrections]
+        )
+
+    def _apply(self, vector: Array) -> Array:
         out = np.zeros((PARTS, len(vector)))
         _apply(
             self.first,
@@ -113,7 +139,11 @@ class Rows:
 
     def gradient(self) -> Array:
         """Half the gradient of the cost, same shape."""
-        out = np.zeros((PARTS, (self.intervals + 3) * 6))
+        return self._gradient(self.residual_m)
+
+    def _gradient(self, values: Array) -> Array:
+        """The columns of all unknowns times values of the rows, weighed and less their planes."""
+        out = np.zeros((PARTS, self.path_size))
         _gradient(
             self.first,
             self.knot,
@@ -122,18 +152,30 @@ class Rows:
             self.plane,
             self.weight,
             self.inverse,
-            self.residual_m,
+            values,
             out,
         )
-        return np.asarray(out.sum(axis=0))
+        if self.lasers is None:
+            return np.asarray(out.sum(axis=0))
+        projected = np.empty(len(values))
+        _project(self.first, self.plane, self.weight, self.inverse, values, projected)
+        return np.concatenate([out.sum(axis=0), self.lasers.gradient(projected)])
 
     def noise(self, rng: np.random.Generator) -> Array:
         """A draw of what the noise of the rows does to the gradient: its covariance is the normal matrix."""
-        out = np.zeros((PARTS, (self.intervals + 3) * 6))
         with np.errstate(divide="ignore"):
             drawn = np.where(self.weight > 0, rng.standard_normal(len(self)) / np.sqrt(self.weight), 0.0)
-        _gradient(self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.inverse, drawn, out)
-        return np.asarray(out.sum(axis=0))
+        return self._gradient(drawn)
+
+    def with_lasers(self, laser: npt.NDArray[np.int32], xyz_m: npt.NDArray[np.float32], normal: Array) -> None:
+        """Take the corrections of the lasers in: each row's laser, its cluster and its plane's normal in the sensor frame."""
+        lasers = columns_of(laser, xyz_m, normal)
+        lasers.border, lasers.corner = np.zeros((UNKNOWNS, self.path_size)), np.zeros((UNKNOWNS, UNKNOWNS))
+        border_of(
+            self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.inverse, lasers.laser,
+            lasers.change, lasers.border, lasers.corner,
+        )  # fmt: skip
+        self.lasers = lasers
 
     def band(self) -> Array:
         """The normal matrix were the planes known: of each interval's four coefficients, shape (intervals, 4, 4, 6, 6)."""
@@ -186,6 +228,10 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     )  # fmt: skip
     rows = Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
     _drop_unobserved(rows, rotation[kept], clusters.xyz_m[kept])
+    if clusters.laser is not None:
+        normal = np.repeat(normals[ids], np.diff(starts), axis=0)
+        in_sensor = np.einsum("nji,nj->ni", rotation[kept].reshape(-1, 3, 3), normal)
+        rows.with_lasers(clusters.laser[kept], clusters.xyz_m[kept], in_sensor)
     return rows
 
 
@@ -522,6 +568,26 @@ def _gradient(
                 r1 += y * plane[i, 0]
                 r2 += y * plane[i, 1]
             _spread_back(start, end, knot, weights, jacobian, plane, weight, inverse[v], r0, r1, r2, scratch, mine)
+
+
+@njit(cache=True, nogil=True)
+def _project(first: Any, plane: Any, weight: Any, inverse: Any, values: Any, out: Any) -> None:
+    """Values of the rows less the best plane of each voxel, weighed."""
+    for v in range(len(first) - 1):
+        r0, r1, r2 = 0.0, 0.0, 0.0
+        for i in range(first[v], first[v + 1]):
+            y = weight[i] * values[i]
+            r0 += y
+            r1 += y * plane[i, 0]
+            r2 += y * plane[i, 1]
+        q = inverse[v]
+        d, a, b = (
+            q[0] * r0 + q[1] * r1 + q[2] * r2,
+            q[1] * r0 + q[3] * r1 + q[4] * r2,
+            q[2] * r0 + q[4] * r1 + q[5] * r2,
+        )
+        for i in range(first[v], first[v + 1]):
+            out[i] = weight[i] * _off_plane(i, plane, values, d, a, b)
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath=True)

@@ -14,7 +14,7 @@ from numba import njit
 
 from groundproc import cloud, decode
 from groundproc.adjustment.rotations import mat_of_quat
-from groundproc.decode import Gate, LaserTable
+from groundproc.decode import Gate
 from groundproc.trajectory.method import Given, Progress
 
 Array = npt.NDArray[np.float64]
@@ -26,10 +26,13 @@ STEPS: Final = 20
 SLICE_NS: Final = STEP_NS * STEPS
 
 CLUSTER_DTYPE: Final = np.dtype(
-    [("time_ns", "<i8"), ("xyz", "<f4", (3,)), ("scatter", "<f4", (6,)), ("count", "<i4"), ("range_m", "<f4")]
-)
+    [
+        ("time_ns", "<i8"), ("xyz", "<f4", (3,)), ("scatter", "<f4", (6,)), ("count", "<i4"), ("range_m", "<f4"),
+        ("laser", "<i4"),
+    ]
+)  # fmt: skip
 """Mean time of the returns [UTC]; their mean in the sensor frame [m] at that time; their scatter about it in the local frame, xx xy xz yy
-yz zz, summed over the returns [m^2]; how many they are; and their mean range [m]."""
+yz zz, summed over the returns [m^2]; how many they are; their mean range [m]; and their laser, 0 where lasers are not told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +47,17 @@ class Slice:
         UTC.
     xyz_m : ndarray of float32, shape (n, 3)
         In the sensor frame.
+    laser : ndarray of uint8, shape (n,), optional
+        Given where the clusters of each laser are to be told apart.
     """
 
     number: int
     time_ns: npt.NDArray[np.int64]
     xyz_m: npt.NDArray[np.float32]
+    laser: npt.NDArray[np.uint8] | None = None
 
 
-def slices(given: Given, start_ns: int, progress: Progress, lasers: LaserTable | None = None) -> Iterator[Slice]:
+def slices(given: Given, start_ns: int, progress: Progress, apart: bool = False) -> Iterator[Slice]:
     """Stream the flight in slices; those without a return are left out.
 
     Parameters
@@ -60,20 +66,22 @@ def slices(given: Given, start_ns: int, progress: Progress, lasers: LaserTable |
     start_ns : int
         Start of the grid [UTC].
     progress : Progress
-    lasers : LaserTable, optional
+    apart : bool
+        Whether lasers are to be told apart.
     """
     survey = given.survey
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
     tally = cloud.Tally()
     times: list[npt.NDArray[np.int64]] = []
     points: list[npt.NDArray[np.float32]] = []
+    lines: list[npt.NDArray[np.uint8]] = []
     number = -1
 
     def told(done: int) -> None:
         progress("adjust", done)
 
     for packets, utc_ns in cloud.chunks(given.readers, given.timeline, tally, told):
-        shots = decode.decode(packets, utc_ns, gate, lasers)
+        shots = decode.decode(packets, utc_ns, gate, given.lasers)
         # at a change of leg the clock may step back by what the synchronisations differ by
         slot = (shots.time_ns - start_ns) // SLICE_NS
         edges = np.flatnonzero(np.diff(slot)) + 1
@@ -82,17 +90,24 @@ def slices(given: Given, start_ns: int, progress: Progress, lasers: LaserTable |
                 continue
             if slot[first] != number and times:
                 if number >= 0:
-                    yield _slice(number, times, points)
-                times, points = [], []
+                    yield _slice(number, times, points, lines)
+                times, points, lines = [], [], []
             number = int(slot[first])
             times.append(shots.time_ns[first:last])
             points.append(shots.xyz_m[first:last])
+            if apart:
+                lines.append(shots.laser[first:last])
     if times and number >= 0:
-        yield _slice(number, times, points)
+        yield _slice(number, times, points, lines)
 
 
-def _slice(number: int, times: Sequence[npt.NDArray[np.int64]], points: Sequence[npt.NDArray[np.float32]]) -> Slice:
-    return Slice(number, np.concatenate(times), np.concatenate(points))
+def _slice(
+    number: int,
+    times: Sequence[npt.NDArray[np.int64]],
+    points: Sequence[npt.NDArray[np.float32]],
+    lines: Sequence[npt.NDArray[np.uint8]],
+) -> Slice:
+    return Slice(number, np.concatenate(times), np.concatenate(points), np.concatenate(lines) if lines else None)
 
 
 TABLE_SIZE: Final = 1 << 16
@@ -113,7 +128,7 @@ class Clusterer:
         self._keys = np.empty(TABLE_SIZE, np.int64)
 
     def __call__(
-        self, piece: Slice, start_ns: int, quat: Array, position_m: Array
+        self, piece: Slice, start_ns: int, quat: Array, position_m: Array, apart: bool = False
     ) -> tuple[npt.NDArray[np.void], Array]:
         """Clusters of a slice.
 
@@ -124,6 +139,8 @@ class Clusterer:
             UTC of the first of the poses.
         quat, position_m : ndarray, shape (STEPS + 1, 4) and (STEPS + 1, 3)
             Poses of the sensor on the grid over the slice, "local from sensor".
+        apart : bool
+            Whether a cluster is of one laser only; the slice has to have them.
 
         Returns
         -------
@@ -133,15 +150,19 @@ class Clusterer:
         """
         count = len(piece.time_ns)
         sums = np.zeros((min(count, TABLE_SIZE // 2), 15))
+        laser = piece.laser if apart and piece.laser is not None else np.zeros(count, np.uint8)
+        lasers = np.zeros(len(sums), np.int32)
         found = _gather(
-            piece.time_ns, piece.xyz_m, start_ns, quat, position_m, self.voxel_m, self._table, self._keys, sums
-        )
+            piece.time_ns, piece.xyz_m, laser, start_ns, quat, position_m, self.voxel_m, self._table, self._keys, sums,
+            lasers,
+        )  # fmt: skip
         clusters = np.empty(found, CLUSTER_DTYPE)
         world = np.empty((found, 3))
         _finish(
             sums[:found], start_ns, quat, position_m, clusters["time_ns"], clusters["xyz"], clusters["scatter"],
             clusters["count"], clusters["range_m"], world,
         )  # fmt: skip
+        clusters["laser"] = lasers[:found]
         return clusters, world
 
 
@@ -164,9 +185,10 @@ def spread(key: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _gather(
-    time_ns: Any, xyz: Any, start_ns: int, quat: Any, position: Any, voxel_m: float, table: Any, keys: Any, sums: Any
-) -> int:
-    """Sums of each voxel: count, time, world x y z, its six second moments, sensor x y z, range; about the voxel's centre."""
+    time_ns: Any, xyz: Any, laser: Any, start_ns: int, quat: Any, position: Any, voxel_m: float, table: Any, keys: Any, sums: Any,
+    lasers: Any,
+) -> int:  # fmt: skip
+    """Sums of each voxel and laser: count, time, world x y z, its six second moments, range; about the voxel's centre, which follows."""
     nodes = len(quat)
     mats = np.empty((nodes, 3, 3))
     for i in range(nodes):
@@ -191,7 +213,8 @@ def _gather(
         x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c_ + m[0, 3]
         y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c_ + m[1, 3]
         z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c_ + m[2, 3]
-        key = voxel_key(x, y, z, per_m)
+        # the upper bits of an axis are its sign again within 2^15 voxels: room for the laser
+        key = voxel_key(x, y, z, per_m) ^ (np.int64(laser[n]) << 58)
         slot = spread(key) & mask
         while table[slot] >= 0 and keys[slot] != key:
             slot = (slot + 1) & mask
@@ -200,6 +223,7 @@ def _gather(
             if found == len(sums):
                 continue
             row = found
+            lasers[row] = laser[n]
             table[slot], keys[slot], slots[found] = row, key, slot
             found += 1
             sums[row, 12] = (np.floor(x * per_m) + 0.5) * voxel_m

@@ -61,7 +61,7 @@ class Problem:
 
     def apply(self, vector: Array) -> Array:
         """The whole normal matrix times a vector."""
-        size = (self.rows.intervals + 3) * 6
+        size = self.rows.size
         out = self.normal @ vector
         out[:size] += self.rows.apply(vector[:size]) / self.deflation
         return np.asarray(out)
@@ -93,13 +93,21 @@ class Problem:
 def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation: float, path: Path) -> Problem:
     """Set a step up, linear about a path."""
     normal, gradient = normal_equations(factors)
-    gradient[: unknowns.path_size] += rows.gradient() / deflation
+    gradient[: rows.size] += rows.gradient() / deflation
     band = _sparse_band(rows.band() * (SHARE / deflation), unknowns.size)
+    if rows.lasers is not None:
+        band = band + _sparse_corner(rows.lasers.corner / deflation, rows.path_size, unknowns.size)
     fine = splu(
         (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
     )
     by_row = normal.tocsr()
     return Problem(rows, deflation, by_row, gradient, fine, coarse_of(rows, deflation, by_row, path))
+
+
+def _sparse_corner(corner: Array, start: int, size: int) -> sparse.csc_matrix:
+    """A square block at its place in the whole matrix."""
+    row, column = np.meshgrid(start + np.arange(len(corner)), start + np.arange(len(corner)), indexing="ij")
+    return sparse.csc_matrix((corner.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
 
 
 def _sparse_band(band: Array, size: int) -> sparse.csc_matrix:

@@ -128,14 +128,15 @@ class Track:
         for i in range(before):
             self.clusters[i] = _NONE
 
-    def gathered(self, start: int, end: int) -> Clusters:
-        """Clusters of slices `start` to `end` as columns."""
+    def gathered(self, start: int, end: int, apart: bool = False) -> Clusters:
+        """Clusters of slices `start` to `end` as columns; `apart`: with their lasers."""
         parts = self.clusters[start:end]
         return Clusters(
             np.concatenate([p["time_ns"] for p in parts]),
             np.concatenate([p["xyz"] for p in parts]),
             np.concatenate([p["scatter"] for p in parts]),
             np.concatenate([p["count"] for p in parts]),
+            np.concatenate([p["laser"] for p in parts]) if apart else None,
         )
 
 
@@ -214,7 +215,7 @@ class Tracker:
         track.gyro_bias.append(state.gyro_bias_rad_s.copy())
         track.sigma.append(np.sqrt(np.diag(state.covariance)[:6]))
         track.matched.append(0 if step is None else step.matched)
-        track.seen.append(0 if step is None else len(step.clusters))
+        track.seen.append(0 if step is None else step.seen)
         track.residual_m.append(float("nan") if step is None else step.residual_m)
         if step is None or not self._keep:
             track.clusters.append(_NONE)

@@ -9,8 +9,9 @@ import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
+from groundproc.adjustment import lasers
 from groundproc.adjustment.anchors import Attitudes, Positions, Tie
-from groundproc.adjustment.batch import DRAWS, Batch, Posterior, make_unit
+from groundproc.adjustment.batch import DRAWS, Batch, Posterior, joined, make_unit
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.motion import ImuTrack, Motion
 from groundproc.adjustment.outside import DELAY, Outside
@@ -50,6 +51,8 @@ class Sources:
         Globals whose covariance is wanted exactly.
     outside : sequence of Outside
         Positions and poses of another program.
+    lasers_apart : bool
+        Whether clusters are of one laser each, and the corrections of lasers unknowns.
     """
 
     units: Mapping[str, ImuTrack]
@@ -59,6 +62,7 @@ class Sources:
     lever_m: Array
     exact: tuple[str, ...] = ()
     outside: Sequence[Outside] = ()
+    lasers_apart: bool = False
 
 
 @dataclass(slots=True)
@@ -80,6 +84,8 @@ class Window:
         What each Gauss-Newton step said.
     covariance : ndarray or None
         Of the globals asked for exactly, without what a gyro's axes may differ from its board's.
+    corrections : tuple of (ndarray, ndarray), optional
+        Of the lasers, shape (64,), and their covariance.
     """
 
     first: int
@@ -91,6 +97,7 @@ class Window:
     sigma_attitude_rad: Array
     log: list[dict[str, float]]
     covariance: Array | None = None
+    corrections: tuple[Array, Array] | None = None
 
 
 def adjust_window(
@@ -119,7 +126,7 @@ def adjust_window(
     ]
     batch = Batch(
         path,
-        track.gathered(first, last),
+        track.gathered(first, last, sources.lasers_apart),
         units,
         dict(sources.units),
         sources.positions,
@@ -138,7 +145,16 @@ def adjust_window(
         attitude = np.hypot(attitude, old.sigma_attitude_rad[old.own])
     values = _values(batch, posterior, draws)
     exact = posterior.covariance(sources.exact) if sources.exact and set(sources.exact) <= set(values) else None
-    return Window(first, last, last - first, batch.path, values, position, attitude, batch.log, exact)
+    corrections = None
+    if sources.lasers_apart:
+        corrections = batch.corrections, lasers.stretched(posterior.covariance(lasers.NAMES), RELATIVE)
+    return Window(first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections)
+
+
+def corrections_over(windows: Sequence[Window]) -> tuple[Array, Array] | None:
+    """Corrections of the lasers that all windows together give, and their covariance; None where they were no unknowns."""
+    told = [window.corrections for window in windows if window.corrections is not None]
+    return joined([o for o, _ in told], [square for _, square in told], lasers.PRIOR) if told else None
 
 
 def _laid_on(path: Path, tie: Tie) -> Path:
@@ -155,7 +171,7 @@ def _values(batch: Batch, posterior: Posterior, draws: Array) -> dict[str, tuple
     found, common = {}, {"compass": batch.compass, DELAY: batch.outside_delay_s}
     for name, where in posterior.unknowns.names.items():
         unit, _, key = name.partition(".")
-        if unit == "world":
+        if unit in ("world", "lasers"):
             continue
         sigma = np.sqrt(np.mean(np.square(draws[:, where]), axis=0))
         if name in common:

@@ -7,5 +7,6 @@ plan          what stands upright, seen from above
 search        one revolution after another, one variable after another: the trims
 course        course over ground, the witness of yaw trims
 compass       trim against heading over several runs
+lasers        corrections of the single lasers: the file
 dynamic       the method: first pass, trims, second pass
 """

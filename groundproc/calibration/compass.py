@@ -27,6 +27,10 @@ PRIOR_DEG: Final = 15.0
 few headings were seen: four streets at right angles cannot tell the second from nothing."""
 LEAST_SCATTER_DEG: Final = 0.1
 """No run is believed to be better than this [deg]."""
+GRID: Final = 72
+INVERTED: Final = 9
+"""Headings at which a curve over the true heading is turned into one over the compass's, and its terms: four harmonics hold what two of 10
+deg become to 0.05 deg."""
 HUBER: Final = 1.5
 ROUNDS: Final = 10
 
@@ -114,16 +118,59 @@ def fit_compass(runs: Sequence[Run], harmonics: int = 2) -> CompassCurve:
         scatter = max(float(np.sqrt((weight * residual**2).sum() / freedom)), LEAST_SCATTER_DEG)
         weight = np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(residual), 1e-12))
     covariance = np.linalg.inv(design.T @ (weight[:, None] * design) / scatter**2 + prior)
-    seen = len(np.unique(np.floor(heading / (2 * np.pi) * BINS).astype(int) % BINS)) / BINS
+    seen = len(np.unique(sector_of(heading))) / BINS
     rows = tuple(tuple(row) for row in covariance.tolist())
     return CompassCurve(tuple(coefficients.tolist()), rows, scatter, len(runs), seen)
+
+
+def curve_of_errors(
+    error_rad: Array, covariance: Array, scatter_deg: float, runs: int, seen: npt.NDArray[np.bool_]
+) -> CompassCurve:
+    """The curve that takes an error away which is known over the true heading.
+
+    Parameters
+    ----------
+    error_rad : ndarray, shape (5,)
+        Stated less true heading: constant, sine and cosine of the true heading, and of twice that.
+    covariance : ndarray, shape (5, 5)
+        Of these [rad^2].
+    scatter_deg : float
+        Of single runs about it.
+    runs : int
+    seen : ndarray of bool, shape (BINS,)
+        Sectors of the stated heading that were flown.
+    """
+    true = 2.0 * np.pi * np.arange(GRID) / GRID
+    errors = _design(true, len(error_rad))
+
+    def coefficients(curve: Array) -> Array:
+        off = errors @ curve
+        return np.asarray(np.linalg.lstsq(_design(true + off, INVERTED), -off, rcond=None)[0], np.float64)
+
+    step = 1e-4
+    by_error = np.stack(
+        [
+            (coefficients(error_rad + s) - coefficients(error_rad - s)) / (2.0 * step)
+            for s in step * np.eye(len(error_rad))
+        ],
+        axis=1,
+    )
+    square = np.rad2deg(1.0) ** 2 * (by_error @ covariance @ by_error.T)
+    rows = tuple(tuple(row) for row in (0.5 * (square + square.T)).tolist())
+    values = tuple(np.rad2deg(coefficients(error_rad)).tolist())
+    return CompassCurve(values, rows, max(scatter_deg, LEAST_SCATTER_DEG), runs, float(np.mean(seen)))
+
+
+def sector_of(heading_rad: Array) -> npt.NDArray[np.int64]:
+    """Number of the sector that headings lie in, shape (n,)."""
+    return np.minimum((np.asarray(heading_rad) % (2 * np.pi) / (2 * np.pi) * BINS).astype(np.int64), BINS - 1)
 
 
 def _sectors(run: Run) -> tuple[Array, Array]:
     """Mean heading [rad] and median trim [deg] in each sector of heading that a run went through."""
     heading = np.asarray(run.heading_rad) % (2 * np.pi)
     trim_deg = np.rad2deg((np.asarray(run.trim_rad) + np.pi) % (2 * np.pi) - np.pi)
-    sector = np.minimum((heading / (2 * np.pi) * BINS).astype(int), BINS - 1)
+    sector = sector_of(heading)
     chosen = np.unique(sector)
     return (
         np.array([heading[sector == i].mean() for i in chosen]),
@@ -139,10 +186,10 @@ def _design(heading_rad: Array, size: int) -> Array:
     return np.stack(columns, axis=1)
 
 
-def write_compass(path: Path, curve: CompassCurve) -> None:
-    """Write compass.yaml."""
+def write_compass(path: Path, curve: CompassCurve, head: str = "") -> None:
+    """Write compass.yaml; `head` stands above the values."""
     with written_aside(path) as aside:
-        aside.write_text(config.dump(curve), encoding="utf-8")
+        aside.write_text(head + config.dump(curve), encoding="utf-8")
 
 
 def read_compass(path: Path) -> CompassCurve:

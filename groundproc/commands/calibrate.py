@@ -1,25 +1,37 @@
-"""`swath calibrate`: the mount from flights, for later ones."""
+"""`swath calibrate`: the mount, the compass curve and the lasers from flights, for later ones."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import statistics
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from groundproc.adjustment.mount_calibration import FlightResult
+    from groundproc.adjustment.mount_calibration import FlightResult, MountCalibration
 
-HELP = "find boresight, lever arm, clock offset and compass curve from flights: a new mount.yaml with its covariance"
+HELP = "find boresight, lever arm, clock offset, compass curve and corrections of the lasers from flights: files for later flights"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="flight logs, each a flight of its own")
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for mount.yaml and calibration.json"
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for mount.yaml, compass.yaml and calibration.json",
     )
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml to begin from, in place of the logs'")
+    parser.add_argument(
+        "--lasers",
+        action="store_true",
+        help="find range and elevation offsets of the 32 lasers as well: lasers.yaml, lasers.png",
+    )
     parser.add_argument("--json", action="store_true", help="print what calibration.json holds")
 
 
@@ -30,8 +42,11 @@ def run(arguments: argparse.Namespace) -> int:
     from flightlog.errors import UsageError
     from flightlog.logfile import LogReader
     from groundproc.adjustment.mount_calibration import calibrate
+    from groundproc.calibration.compass import write_compass
+    from groundproc.calibration.lasers import write_lasers
     from groundproc.files import made_folder, written_aside
     from groundproc.mounting import find_mount
+    from groundproc.products.laser_plot import draw_lasers
     from groundproc.progress import stages
 
     logs = arguments.logs
@@ -42,12 +57,17 @@ def run(arguments: argparse.Namespace) -> int:
     flights: list[FlightResult] = []
     with stages(logs, {"read": "clocks and autopilots", "adjust": "flights"}) as progress:
         for path in logs:
-            flights.append(_adjusted(path, nominal, progress))
+            flights.append(_adjusted(path, nominal, arguments.lasers, progress))
     result = calibrate(flights)
     report = result.report(nominal)
     with made_folder(arguments.output):
         with written_aside(arguments.output / "mount.yaml") as aside:
             aside.write_text(_header(report) + result.mount(nominal).yaml(), encoding="utf-8")
+        if result.compass_found:
+            write_compass(arguments.output / "compass.yaml", result.compass, _compass_head(result))
+        if result.lasers is not None:
+            write_lasers(arguments.output / "lasers.yaml", result.lasers.file(), _lasers_head(result))
+            draw_lasers(arguments.output / "lasers.png", result.lasers)
         with written_aside(arguments.output / "calibration.json") as aside:
             aside.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(report, indent=2) if arguments.json else _text(report, arguments.output))
@@ -61,12 +81,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _adjusted(path: Path, nominal: Any, progress: Any) -> FlightResult:
+def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> FlightResult:
     """One flight."""
     from flightlog.errors import LogError
     from flightlog.logfile import LogReader
     from groundproc.adjustment import adjusted
-    from groundproc.adjustment.mount_calibration import SHARED, flight_result
+    from groundproc.adjustment.mount_calibration import COMPASS, SHARED, flight_result
+    from groundproc.calibration.lasers import ESTIMATE
     from groundproc.flight import read_flight
     from groundproc.survey import Survey
     from groundproc.timeline import legs
@@ -74,14 +95,14 @@ def _adjusted(path: Path, nominal: Any, progress: Any) -> FlightResult:
     from groundproc.trajectory.methods import ins_estimate
 
     with LogReader(path) as reader:
-        survey = Survey(method="adjusted")
+        survey = Survey(method="adjusted", lasers=ESTIMATE if with_lasers else None)
         flight = read_flight([reader], "ins", lambda done: progress("read", done))
         timeline = legs(flight.runs, flight.boots, nominal.mat_ins_lidar(), survey.sync)
         given = gather([reader], flight, timeline, nominal, survey)
         start = ins_estimate(given, progress).trajectory
         leg = max(given.placed, key=lambda leg: leg.sync.samples)
         same = [other for other in given.placed if other.run == leg.run]
-        run = adjusted.adjust_run(given, same, leg.run, start, progress, exact=SHARED)
+        run = adjusted.adjust_run(given, same, leg.run, start, progress, SHARED + COMPASS)
         found = flight_result(path, run.windows, nominal, leg.sync.offset_ns * 1e-9, "; ".join(run.warnings()))
     if found is None:
         raise LogError(
@@ -101,6 +122,33 @@ def _header(report: dict[str, Any]) -> str:
     kept = [name for name, found in zip(report["parameters"], report["found"], strict=True) if not found]
     if kept:
         lines.append(f"not observed, left as they were: {', '.join(kept)}")
+    return "".join(f"# {line}\n" for line in lines)
+
+
+def _compass_head(result: MountCalibration) -> str:
+    """What stands above the values of compass.yaml."""
+    seen, unseen = result.compass_sigma_deg()
+    rest = (
+        "all headings flown" if result.headings.all() else f"up to {unseen:.1f} deg at the others, which are not flown"
+    )
+    return (
+        f"# calibrated from {len(result.flights)} flights: {', '.join(flight.name for flight in result.flights)}\n"
+        f"# {result.compass.seen:.0%} of all headings flown; sigma up to {seen:.1f} deg there, {rest}\n"
+    )
+
+
+def _lasers_head(result: MountCalibration) -> str:
+    """What stands above the values of lasers.yaml."""
+    assert result.lasers is not None
+    seen = [int(result.lasers.of(kind)[2].sum()) for kind in ("range", "elevation")]
+    (far, sigma_far), (up, sigma_up) = (result.lasers.mean(kind) for kind in ("range", "elevation"))
+    lines = [
+        f"calibrated from {len(result.flights)} flights: {', '.join(flight.name for flight in result.flights)}",
+        "belongs to that one sensor; found together with mount.yaml, with which it is to be used",
+        f"in firing order; found: {seen[0]} ranges, {seen[1]} elevations, the others left as they were",
+        f"mean range offset of all {far * 1e3:.1f} mm, sigma {sigma_far * 1e3:.1f} mm",
+        f"mean elevation offset {math.degrees(up):.4f} deg, sigma {math.degrees(sigma_up):.4f} deg",
+    ]
     return "".join(f"# {line}\n" for line in lines)
 
 
@@ -127,5 +175,37 @@ def _text(report: dict[str, Any], folder: Path) -> str:
         lines.append(
             f"agreement of the flights: chi-square {report['chi_square']:.1f}, {report['degrees_of_freedom']} expected"
         )
-    lines.append(f"written: {folder / 'mount.yaml'}, {folder / 'calibration.json'}")
+    lines += _compass_text(report["compass"])
+    if "lasers" in report:
+        lines += _lasers_text(report["lasers"])
+    lines.append(f"written into {folder}: mount.yaml, {_names(report)}calibration.json")
     return "\n".join(lines)
+
+
+def _names(report: dict[str, Any]) -> str:
+    """Files beside the two that are always there."""
+    return ("compass.yaml, " if report["compass"]["found"] else "") + (
+        "lasers.yaml, lasers.png, " if "lasers" in report else ""
+    )
+
+
+def _compass_text(compass: dict[str, Any]) -> list[str]:
+    """What the flights say of the compass."""
+    share = len(compass["headings_seen_deg"]) * compass["sector_deg"] / 360.0
+    sigma = compass["largest_sigma_deg"]
+    if not compass["found"]:
+        return [f"compass: not observed ({share:.0%} of all headings flown); no compass.yaml"]
+    rest = "" if share == 1.0 else f", {sigma['elsewhere']:.1f} deg elsewhere"
+    return [f"compass: {share:.0%} of all headings flown, sigma up to {sigma['seen']:.1f} deg there{rest}"]
+
+
+def _lasers_text(lasers: dict[str, Any]) -> list[str]:
+    """What the flights say of the lasers."""
+    seen = [32 - sum(lasers[f"{kind}_held"]) for kind in ("range", "elevation")]
+    sigma = [statistics.median(lasers[name]) for name in ("sigma_range_m", "sigma_elevation_deg")]
+    return [
+        f"lasers: {seen[0]} of 32 ranges found, median sigma {sigma[0] * 1e3:.2f} mm",
+        f"        {seen[1]} of 32 elevations found, median sigma {sigma[1]:.4f} deg",
+        f"        mean range {lasers['mean_range_m'] * 1e3:+.2f} mm, sigma {lasers['sigma_mean_range_m'] * 1e3:.2f} mm",
+        f"        mean elevation {lasers['mean_elevation_deg']:+.4f} deg, sigma {lasers['sigma_mean_elevation_deg']:.4f} deg",
+    ]

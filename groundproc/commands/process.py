@@ -52,6 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--compass", type=Path, metavar="FILE", help="compass model that method dynamic begins with")
     parser.add_argument(
+        "--lasers",
+        metavar="FILE",
+        help="corrections of the single lasers, as `swath calibrate --lasers` writes them; or estimate, to have method adjusted find them",
+    )
+    parser.add_argument(
         "--trajectory", type=Path, metavar="CSV", help="poses from elsewhere, in place of the autopilot's"
     )
     parser.add_argument("--json", action="store_true", help="print what quality.json holds")
@@ -82,14 +87,15 @@ def run(arguments: argparse.Namespace) -> int:
 def _survey(arguments: argparse.Namespace) -> Survey:
     """The survey file with the command line's options laid over it."""
     from flightlog import config
+    from groundproc.calibration.lasers import ESTIMATE
     from groundproc.options import field_of_view, milliseconds
     from groundproc.survey import Survey
 
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())
     if isinstance(tree["mount"], str):
         tree["mount"] = str(arguments.config.parent / tree["mount"])
-    for name in ("compass", "positions"):
-        if tree[name] is not None:
+    for name in ("compass", "positions", "lasers"):
+        if tree[name] not in (None, ESTIMATE):
             tree[name] = str(arguments.config.parent / tree[name])
     given = {
         "crs": arguments.crs,
@@ -103,6 +109,7 @@ def _survey(arguments: argparse.Namespace) -> Survey:
         "mount": arguments.mount and str(arguments.mount),
         "compass": arguments.compass and str(arguments.compass),
         "positions": arguments.positions and str(arguments.positions),
+        "lasers": arguments.lasers,
     }
     return config.from_mapping(tree | {k: v for k, v in given.items() if v is not None}, Survey, "command line")
 

@@ -362,7 +362,7 @@ class Estimator:
             self._refresh_start()
             return []
         self.state = "tracking" if len(shots.time_ns) else "the lidar is silent, inertial data only"
-        return [self._place(end_ns, step.matched, len(step.clusters), step.residual_m, shots)]
+        return [self._place(end_ns, step.matched, step.seen, step.residual_m, shots)]
 
     def _count(self, shots: Shots) -> None:
         figures = self.figures

@@ -8,6 +8,7 @@ from typing import Any
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc import geodesy
+from groundproc.calibration.lasers import ESTIMATE, read_lasers
 from groundproc.decode import LaserTable
 from groundproc.flight import Flight
 from groundproc.geodesy import LocalFrame
@@ -41,6 +42,8 @@ class Given:
     mount : Mount
         Nominal.
     survey : Survey
+    lasers : LaserTable
+        Of the survey's file; the manual's where it names none.
     """
 
     readers: Sequence[LogReader]
@@ -51,6 +54,7 @@ class Given:
     frame: LocalFrame
     mount: Mount
     survey: Survey
+    lasers: LaserTable = field(default_factory=LaserTable.nominal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,4 +112,9 @@ def gather(
     fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in placed]
     first = fixes[0]
     frame = LocalFrame(float(first.latitude_deg[0]), float(first.longitude_deg[0]), float(first.height_m[0]))
-    return Given(readers, flight, timeline, placed, fixes, frame, mount, survey)
+    return Given(readers, flight, timeline, placed, fixes, frame, mount, survey, chosen_table(survey))
+
+
+def chosen_table(survey: Survey) -> LaserTable:
+    """The lasers as the survey has them: of its file, or the manual's, to begin with where they are to be estimated."""
+    return LaserTable.nominal() if survey.lasers in (None, ESTIMATE) else read_lasers(Path(survey.lasers)).table()

@@ -9,6 +9,7 @@ import numpy as np
 from flightlog.errors import CoverageError, LogError, UsageError
 from groundproc.adjustment import adjusted
 from groundproc.calibration import dynamic
+from groundproc.calibration.lasers import ESTIMATE
 from groundproc.survey import Survey
 from groundproc.trajectory import filtered, ins
 from groundproc.trajectory.method import Estimate, Given, Progress
@@ -36,7 +37,8 @@ def estimate(given: Given, progress: Progress) -> Estimate:
                 raise
             reasons.append(f"not {name}, because {str(error).removeprefix(f'{name}: ')}")
             continue
-        return replace(made, method=name, note="; ".join(reasons))
+        lasers = made.lasers if given.survey.lasers == ESTIMATE else given.lasers
+        return replace(made, method=name, note="; ".join(reasons), lasers=lasers)
     raise AssertionError(f"no method for {given.survey.method}")
 
 
@@ -72,6 +74,8 @@ def check(survey: Survey) -> None:
             raise UsageError(
                 f"{name}: {value} given together with causal, which uses nothing that is known after the flight only"
             )
+    if survey.lasers == ESTIMATE and (survey.causal or candidates(survey)[0] != "adjusted"):
+        raise UsageError("lasers: estimate given, but only method adjusted finds them, and not with --causal")
 
 
 def ins_estimate(given: Given, progress: Progress) -> Estimate:

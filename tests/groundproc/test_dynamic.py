@@ -17,7 +17,15 @@ from scipy.stats import binned_statistic_2d
 from flightlog import frames
 from flightlog.errors import ConfigError, LogError
 from groundproc.calibration import ground_model, plan
-from groundproc.calibration.compass import CompassCurve, Run, fit_compass, read_compass, write_compass
+from groundproc.calibration.compass import (
+    BINS,
+    CompassCurve,
+    Run,
+    curve_of_errors,
+    fit_compass,
+    read_compass,
+    write_compass,
+)
 from groundproc.calibration.course import Course, compare
 from groundproc.calibration.ground_model import Raster
 from groundproc.calibration.options import DynamicOptions, StepOptions
@@ -392,3 +400,45 @@ def test_trims_are_read_as_they_were_written(tmp_path: Path) -> None:
     path.write_text("utc_ns,heading_deg,yaw_deg\n1,2\n")
     with pytest.raises(LogError, match="no table of trims"):
         read_yaw(path)
+
+
+# Compass curve of an adjustment ----------------------------------------------------------------------------------------
+
+ERROR = np.deg2rad([2.0, 6.0, -5.0, 2.0, -1.5])
+
+
+def error_rad(curve: Array, true: Array) -> Array:
+    """Stated less true heading, over the true one."""
+    terms = [np.ones_like(true), np.sin(true), np.cos(true), np.sin(2 * true), np.cos(2 * true)]
+    return np.asarray(curve @ np.stack(terms))
+
+
+def test_an_error_over_the_true_heading_becomes_a_trim_over_the_compass_heading() -> None:
+    curve = curve_of_errors(ERROR, np.zeros((5, 5)), 0.0, 1, np.ones(BINS, np.bool_))
+    true = np.linspace(0, 2 * np.pi, 100)
+    stated = true + error_rad(ERROR, true)
+    np.testing.assert_allclose(stated + curve.trim_rad(stated), true, atol=np.deg2rad(0.05))
+    assert curve.seen == 1.0
+    assert np.rad2deg(curve.sigma_rad(true)) == pytest.approx(0.1)
+
+
+def test_its_sigma_is_that_of_the_error_at_every_heading() -> None:
+    """Known to 0.3 deg in what 60 to 150 deg show, and hardly elsewhere; draws of such curves are the witness."""
+    flown = np.deg2rad(np.linspace(60, 150, 40))
+    terms = np.stack([np.ones_like(flown), np.sin(flown), np.cos(flown), np.sin(2 * flown), np.cos(2 * flown)])
+    prior = np.deg2rad([5.0, 10.0, 10.0, 4.0, 4.0])
+    covariance = np.linalg.inv(terms @ terms.T / (40 * np.deg2rad(0.3) ** 2) + np.diag(prior**-2))
+    curve = curve_of_errors(ERROR, covariance, 0.0, 1, np.arange(BINS) < 9)
+    rng, heading = np.random.default_rng(8), np.linspace(0, 2 * np.pi, 36, endpoint=False)
+    # small ones: far out the turning over of the curve is not linear
+    draws = [
+        curve_of_errors(ERROR + 0.1 * d, covariance, 0.0, 1, np.ones(BINS, np.bool_)).trim_rad(heading)
+        for d in rng.multivariate_normal(np.zeros(5), covariance, 400)
+    ]
+    spread = 10.0 * np.std(draws, axis=0)
+    sigma = np.sqrt(curve.sigma_rad(heading) ** 2 - np.deg2rad(0.1) ** 2)
+    np.testing.assert_allclose(sigma, spread, rtol=0.15)
+    inside = (heading > np.deg2rad(75)) & (heading < np.deg2rad(135))
+    assert np.rad2deg(sigma[inside]).max() < 0.6
+    assert np.rad2deg(sigma).max() > 5.0
+    assert curve.seen == 0.25

@@ -1,0 +1,109 @@
+"""`swath calibrate` from the log on, against the simulation's truth: lasers, compass, and what a later flight makes of the files."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flightlog.hdl32e import LASERS
+from flightlog.logfile import LogReader
+from groundproc.accuracy.judge import judge
+from groundproc.accuracy.truth import on_lidar_clock, read_truth
+from groundproc.calibration.compass import BINS, read_compass
+from groundproc.calibration.lasers import ESTIMATE, read_lasers
+from groundproc.cli import main
+from groundproc.flight import read_flight
+from groundproc.survey import Survey
+from groundproc.timeline import legs
+from groundproc.trajectory import methods
+from groundproc.trajectory.method import Estimate, gather
+
+SECONDS = 20.0
+
+
+@pytest.fixture(scope="module")
+def flight(simulated: Callable[..., Any]) -> Any:
+    """Along buildings at 5 m/s, lasers off by 7 mm and 0.03 deg, gyros at 100 Hz, boresight, delay and scales off."""
+    from simulator.plans import plan
+
+    options = plan("survey_fast_gyro").options
+    lidar = replace(options.lidar, laser_bias_m=0.007, elevation_error_deg=0.03)
+    return simulated("calibrated_flight", "village", SECONDS, replace(options, lidar=lidar), seed=11, points=True)
+
+
+@pytest.fixture(scope="module")
+def made(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("calibrate") / "out"
+    assert main(["calibrate", str(flight.log), "--lasers", "-o", str(folder)]) == 0
+    return folder
+
+
+def adjusted(folder: Path, lasers: str | None) -> tuple[Estimate, Any]:
+    truth = read_truth(folder)
+    with LogReader(truth.log) as reader:
+        read = read_flight([reader], "ins")
+        timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+        survey = Survey(method="adjusted", lasers=lasers)
+        estimate = methods.estimate(
+            gather([reader], read, timeline, truth.nominal_mount, survey), lambda stage, size: None
+        )
+        placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
+        return estimate, judge([reader], truth, placed, estimate.mount, estimate.lasers).figures
+
+
+def test_offsets_of_the_lasers_are_found_within_their_sigma(made: Path, flight: Any) -> None:
+    """A bias is what a range is too long by, and an elevation error what a laser looks too high: corrections take off and add."""
+    found, report = read_lasers(made / "lasers.yaml"), json.loads((made / "calibration.json").read_text())["lasers"]
+    true = np.concatenate(
+        [-np.array(flight.truth["laser_bias_m"]), np.deg2rad(flight.truth["laser_elevation_error_deg"])]
+    )
+    off = np.concatenate([report["range_m"], np.deg2rad(report["elevation_deg"])]) - true
+    sigma = np.concatenate([report["sigma_range_m"], np.deg2rad(report["sigma_elevation_deg"])])
+    covariance = np.array(report["correlation"]) * np.outer(sigma, sigma)
+    assert np.abs(off / sigma).max() < 4.0
+    # together, as they are correlated: the mean of 64 squares is 1 to a fifth
+    assert off @ np.linalg.solve(covariance + np.diag((0.03 * sigma) ** 2), off) / len(off) < 2.0
+    # one against the others they are known to a tenth of what they were
+    assert np.std(off[:LASERS]) < 0.1 * np.std(true[:LASERS])
+    assert np.std(off[LASERS:]) < 0.15 * np.std(true[LASERS:])
+    np.testing.assert_allclose(found.range_m, report["range_m"], atol=1e-5)
+    assert (made / "lasers.png").stat().st_size > 10_000
+
+
+def test_a_later_run_with_the_file_has_the_sharper_cloud(made: Path, flight: Any) -> None:
+    without, before = adjusted(flight.folder, None)
+    given, after = adjusted(flight.folder, str(made / "lasers.yaml"))
+    estimated, itself = adjusted(flight.folder, ESTIMATE)
+    assert (without.lasers.range_offset_m == 0.0).all()
+    np.testing.assert_allclose(given.lasers.range_offset_m, estimated.lasers.range_offset_m, atol=1e-3)
+    assert estimated.report["lasers"]["range_held"] == [False] * LASERS
+    # 15 mm of noise, and what 7 mm of bias and 0.03 deg at 10 to 20 m add to it
+    for figures in (after, itself):
+        assert figures["point_rms_m"] < 0.9 * before["point_rms_m"]
+        assert figures["ate_m"] < before["ate_m"] + 0.002
+
+
+def test_the_compass_curve_holds_where_it_was_flown_and_says_where_it_was_not(made: Path, flight: Any) -> None:
+    report = json.loads((made / "calibration.json").read_text())["compass"]
+    assert (made / "compass.yaml").exists() == report["found"]
+    assert report["found"]
+    curve, options = read_compass(made / "compass.yaml"), flight.truth["options"]["ins"]
+    true = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
+    phase = flight.truth["compass_phase_rad"]
+    error = np.deg2rad(
+        options["compass_offset_deg"]
+        + options["compass_bias_deg"] * (np.sin(true + phase[0]) + 0.3 * np.sin(2 * true + phase[1]))
+    )
+    heading = (true + error) % (2.0 * np.pi)
+    sector = (heading / (2.0 * np.pi) * BINS).astype(int)
+    flown = np.isin(sector, np.round(np.array(report["headings_seen_deg"]) / report["sector_deg"]).astype(int))
+    assert 0.0 < curve.seen < 1.0
+    off, sigma = curve.trim_rad(heading) + error, curve.sigma_rad(heading)
+    assert np.abs(off / sigma)[flown].max() < 3.0
+    assert np.abs(off / sigma).max() < 4.0
+    assert np.rad2deg(sigma[~flown]).max() > 1.5 * np.rad2deg(sigma[flown]).min()
+    assert "of all headings flown" in (made / "compass.yaml").read_text().splitlines()[1]
