@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.constants import NS_PER_S
-from groundproc.adjustment.factors import Factor, RowBuilder, Unknowns, cross, eye, whitened
+from groundproc.adjustment.factors import Factor, RowBuilder, Unknowns, averaged, cross, eye, whitened
 from groundproc.adjustment.scans import STEP_NS, STEPS
 from groundproc.adjustment.spline import Path, basis
 
@@ -136,7 +136,7 @@ def means(values: Array, group: Ints) -> Array:
 
 
 def position_factor(given: Positions, path: Path, unknowns: Unknowns) -> Factor | None:
-    """Positions in means of a second; None where the path covers fewer than two."""
+    """Positions in means of a second, their mean and their differences; None where the path covers fewer than two."""
     inside = within(given.time_ns, path)
     if inside.sum() < 2:
         return None
@@ -152,7 +152,7 @@ def position_factor(given: Positions, path: Path, unknowns: Unknowns) -> Factor 
     builder.at_times(row, knot, weights, 3, eye(count))
     builder.by(row, "world.turn", -cross(position[middle]))
     builder.by(row, "world.shift", eye(count))
-    return whitened(
+    return averaged(
         "position",
         residual,
         builder.matrix(),
