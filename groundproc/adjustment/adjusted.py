@@ -20,6 +20,7 @@ from groundproc.adjustment.anchors import Attitudes, Positions, within
 from groundproc.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
 from groundproc.adjustment.beginning import BEGINNING, redo_beginning
 from groundproc.adjustment.factors import H
+from groundproc.adjustment.joining import Joined, joining
 from groundproc.adjustment.lasers import Corrections
 from groundproc.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
 from groundproc.adjustment.outside import DELAY, outside_track
@@ -33,8 +34,10 @@ from groundproc.adjustment.windows import (
     Sources,
     Window,
     adjust_window,
+    all_patches,
     corrections_over,
     joined_path,
+    whole_stiffness,
 )
 from groundproc.autopilot import Boot
 from groundproc.calibration.lasers import ESTIMATE
@@ -126,6 +129,8 @@ class Run:
     track : Track
     motion : Motion
     sources : Sources
+    joined : Joined or None
+        What the windows' joining found, where there is more than one.
     """
 
     SIGMA_SOURCE: ClassVar = (
@@ -138,16 +143,17 @@ class Run:
     track: Track
     motion: Motion
     sources: Sources
+    joined: Joined | None = None
 
     def estimates(self) -> dict[str, tuple[Array, Array]]:
-        """Globals over all windows: mean by their variances, and its sigma."""
+        """Globals over all windows: mean by their variances, and its sigma; the compass curve is that of the windows' joining."""
         found = {}
         for name in self.windows[0].values:
             values = np.array([window.values[name][0] for window in self.windows])
             weights = np.array([window.values[name][1] for window in self.windows]) ** -2.0
             sigma = np.hypot(weights.sum(axis=0) ** -0.5, UNSEEN.get(name, 0.0))
             found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), sigma)
-        return found
+        return found if self.joined is None else found | {"compass": self.joined.compass}
 
     def mount(self, nominal: Mount) -> Mount:
         """The mount as estimated."""
@@ -178,6 +184,9 @@ class Run:
         """The path as that of the ins frame, with the posterior's sigmas."""
         position = np.concatenate([w.sigma_position_m[: w.own + (w is self.windows[-1])] for w in self.windows])
         attitude = np.concatenate([w.sigma_attitude_rad[: w.own + (w is self.windows[-1])] for w in self.windows])
+        if self.joined is not None:
+            position = np.hypot(position, self.joined.sigma_position_m[: len(position)])
+            attitude = np.hypot(attitude, self.joined.sigma_attitude_rad[: len(attitude)])
         grid, knots = np.arange(len(self.path.quat)), np.arange(len(position)) * STEPS
         sigmas = (np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (position, attitude))
         return of_ins(self.path, self.motion, given.frame, mount, *sigmas)
@@ -191,7 +200,9 @@ class Run:
                 f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1 or less; the cloud may be "
                 "doubled"
             )
-        moved = max(window.log[-1]["moved_m"] for window in self.windows)
+        moved = max(
+            log[-1]["moved_m"] for log in [w.log for w in self.windows] + ([self.joined.log] if self.joined else [])
+        )
         if moved > UNSETTLED_M:
             found.append(
                 f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
@@ -265,6 +276,7 @@ class Run:
             "windows": [
                 {"start_s": w.first * H, "seconds": (w.last - w.first) * H, "rounds": w.log} for w in self.windows
             ],
+            "joining": None if self.joined is None else self.joined.report(),
             "estimated": values,
             "outside": [
                 {
@@ -439,27 +451,96 @@ def adjust_run(
         motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
         attitudes=sources.attitudes[0] if sources.attitudes else None,
     )  # fmt: skip
+    pace = Pace(progress)
     windows: list[Window] = []
     begin = 0
     early: list[Slice] = []
-    for piece in slices(given, motion.start_ns, progress, sources.lasers_apart):
+    for piece in slices(given, motion.start_ns, pace.read, sources.lasers_apart):
         tracker.feed(piece)
         if tracker.track is None:
             continue
         if len(tracker.track) <= BEGINNING:
             early.append(piece)
         if len(tracker.track) - begin >= WINDOW:
-            if not windows and tracker.odometry is not None:
-                redo_beginning(tracker.track, motion, early, tracker.odometry.state)
-            windows.append(adjust_window(tracker.track, motion, sources, begin, len(tracker.track), windows))
-            begin = len(tracker.track) - OVERLAP
+            _redo(tracker, motion, early)
+            last = len(tracker.track)
+            windows.append(
+                adjust_window(tracker.track, motion, sources, begin, last, windows, more=True, told=pace.stepped)
+            )
+            pace.caught_up()
+            begin = last - OVERLAP
+            windows[-1].own = begin - windows[-1].first
             tracker.track.forget(begin)
     track = tracked(tracker)
-    if not windows and tracker.odometry is not None:
-        redo_beginning(track, motion, early, tracker.odometry.state)
+    _redo(tracker, motion, early)
     if not windows or len(track) - begin > OVERLAP:
-        windows.append(adjust_window(track, motion, sources, begin, len(track), windows))
-    return Run(windows, joined_path(windows), track, motion, sources)
+        windows.append(adjust_window(track, motion, sources, begin, len(track), windows, more=False, told=pace.stepped))
+    else:
+        windows[-1].own = windows[-1].last - windows[-1].first
+    pace.caught_up()
+    return joined_run(windows, track, motion, sources)
+
+
+def _redo(tracker: Tracker, motion: Motion, early: list[Slice]) -> None:
+    """The beginning again, before the first window; its slices are not kept after that."""
+    if early and tracker.track is not None and tracker.odometry is not None:
+        redo_beginning(tracker.track, motion, early, tracker.odometry.state)
+    early.clear()
+
+
+def joined_run(windows: list[Window], track: Track, motion: Motion, sources: Sources) -> Run:
+    """The windows as one run: more than one are adjusted together."""
+    run = Run(windows, joined_path(windows), track, motion, sources)
+    if windows[0].seen is None:
+        return run
+    values = run.estimates()
+    boresight = turned(values["ins.turn"][0]) if "ins.turn" in values else np.eye(3)
+    run.joined = joining(
+        run.path, all_patches(windows), whole_stiffness(windows), sources.positions, sources.attitudes,
+        boresight @ sources.mat_ins_lidar.T, values["compass"][0], sources.outside,
+        float(values[DELAY][0][0]) if DELAY in values else 0.0,
+    ).run()  # fmt: skip
+    run.path = run.joined.applied(run.path)
+    for window in windows:
+        window.seen = None
+    return run
+
+
+class Pace:
+    """Tells the progress of reading and adjusting as one: a window's bytes count in part as they are read, in part as it is adjusted.
+
+    Parameters
+    ----------
+    progress : callable
+    """
+
+    READING: Final = 0.4
+    """Part of the work that is done while the log is read: the odometry."""
+    STEPS: Final = 8
+    """Steps that a window takes, or so."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._owed, self._step = 0, 0
+
+    def read(self, stage: str, done: int) -> None:
+        """So many bytes more are read."""
+        now = round(self.READING * done)
+        self._owed += done - now
+        self._step = self._owed // self.STEPS
+        self._progress(stage, now)
+
+    def stepped(self) -> None:
+        """A step of a window is done."""
+        self._pay(min(self._step, self._owed))
+
+    def caught_up(self) -> None:
+        """A window is done."""
+        self._pay(self._owed)
+
+    def _pay(self, done: int) -> None:
+        self._owed -= done
+        self._progress("adjust", done)
 
 
 def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) -> Array:

@@ -8,8 +8,8 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.constants import NS_PER_S
-from groundproc.adjustment.factors import Factor, RowBuilder, Unknowns, averaged, cross, eye, whitened
-from groundproc.adjustment.scans import STEP_NS, STEPS
+from groundproc.adjustment.factors import Factor, RowBuilder, Unknowns, cross, eye, whitened
+from groundproc.adjustment.scans import STEPS
 from groundproc.adjustment.spline import Path, basis
 
 Array = npt.NDArray[np.float64]
@@ -101,7 +101,7 @@ def tie_factor(given: Tie, path: Path, unknowns: Unknowns) -> Factor:
 
 def spots(time_ns: Ints, path: Path) -> tuple[Ints, Array, Ints, Array]:
     """Interval, spline weights, grid step, and share of it at times within a path."""
-    g = (time_ns - path.start_ns) / STEP_NS
+    g = (time_ns - path.start_ns) / path.step_ns
     step = np.clip(g.astype(np.int64), 0, len(path.quat) - 2)
     knot = np.clip(step // STEPS, 0, path.intervals - 1)
     weights = np.array([basis(float(u)) for u in g / STEPS - knot]).reshape(-1, 4)
@@ -117,7 +117,7 @@ def poses(path: Path, step: Ints, share: Array) -> tuple[Array, Array]:
 
 def within(time_ns: Ints, path: Path) -> npt.NDArray[np.bool_]:
     """Which times a path covers."""
-    return np.asarray((time_ns >= path.start_ns) & (time_ns <= path.start_ns + (len(path.quat) - 1) * STEP_NS))
+    return np.asarray((time_ns >= path.start_ns) & (time_ns <= path.start_ns + (len(path.quat) - 1) * path.step_ns))
 
 
 def seconds(time_ns: Ints) -> tuple[Ints, Ints]:
@@ -135,11 +135,21 @@ def means(values: Array, group: Ints) -> Array:
     return np.asarray(total / np.bincount(group)[:, None])
 
 
-def position_factor(given: Positions, path: Path, unknowns: Unknowns) -> Factor | None:
-    """Positions in means of a second, their mean and their differences; None where the path covers fewer than two."""
+def fixes_name(number: int) -> str:
+    """The unknown that the mean error of the n-th source of positions is."""
+    return f"world.fixes{number}"
+
+
+def position_factors(given: Positions, path: Path, unknowns: Unknowns, number: int = 0) -> list[Factor]:
+    """Positions in means of a second: their course, and their mean; none where the path covers fewer than two.
+
+    The course alone, with an unknown mean error, bends and turns the path. Where the whole lies is left to the plain mean of the fixes,
+    by 1 / sigma^2: the best weights of errors that last would lay two thirds of a minute's weight on its first and last fix, and are best
+    by a tenth at most, if the errors last as long as stated and not otherwise.
+    """
     inside = within(given.time_ns, path)
     if inside.sum() < 2:
-        return None
+        return []
     time_ns = given.time_ns[inside]
     _, _, step, share = spots(time_ns, path)
     quat, position = poses(path, step, share)
@@ -152,15 +162,59 @@ def position_factor(given: Positions, path: Path, unknowns: Unknowns) -> Factor 
     builder.at_times(row, knot, weights, 3, eye(count))
     builder.by(row, "world.turn", -cross(position[middle]))
     builder.by(row, "world.shift", eye(count))
-    return averaged(
-        "position",
-        residual,
-        builder.matrix(),
-        time_ns[middle].astype(np.float64) * 1e-9,
-        sigma,
-        given.tau_s,
-        given.white_m,
-    )
+    if fixes_name(number) in unknowns.names:
+        builder.by(row, fixes_name(number), -eye(count))
+    time_s = (time_ns[middle] - time_ns[0]) * 1e-9
+    course = whitened("position", residual, builder.matrix(), time_s, sigma, given.tau_s, given.white_m)
+    if fixes_name(number) not in unknowns.names:
+        return [course]
+    return [course, _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)]
+
+
+SAMPLES: Final = 8
+"""Moments of the flight by which the mean of the fixes is stated."""
+
+
+def _mean_factor(
+    residual: Array, position_m: Array, spline: tuple[Ints, Array], time_s: Array, sigma: Array, given: Positions,
+    unknowns: Unknowns,
+) -> Factor:  # fmt: skip
+    """The mean of the residuals, shape (n, 3), as three rows.
+
+    By every coefficient of the spline they would be dense. So they are stated by a few moments of the flight, with weights by which
+    all that moves or turns the path as one moves their mean as it moves the mean of all. Bends are seen a little wrong; as the
+    residual is that of the path as it is, that costs a step and not the result.
+    """
+    weights = sigma**-2.0 / (sigma**-2.0).sum(axis=0)
+    builder, row = RowBuilder(3, unknowns), np.zeros(1, np.int64)
+    centre = weights.T @ position_m
+    some = np.unique(np.linspace(0, len(time_s) - 1, SAMPLES).round().astype(np.int64))
+    shares = np.stack([_shares(position_m[some] - centre[axis]) for axis in range(3)], axis=1)
+    for i, share in zip(some, shares, strict=True):
+        builder.at_times(row, spline[0][i : i + 1], spline[1][i : i + 1], 3, np.diag(share)[None])
+    builder.by(row, "world.turn", np.stack([-cross(centre)[axis, axis] for axis in range(3)])[None])
+    builder.by(row, "world.shift", eye(1))
+    deviation = mean_sigma(time_s, sigma, weights, given.tau_s, given.white_m)
+    return Factor("position mean", (weights * residual).sum(axis=0), builder.matrix(), deviation)
+
+
+def _shares(places: Array) -> Array:
+    """Weights, sum 1, by which places, shape (n, 3), have their mean in the origin as nearly as may be; the most even ones."""
+    even = np.full(len(places), 1.0 / len(places))
+    asked = np.concatenate([np.ones((1, len(places))), places.T])
+    return np.asarray(even + np.linalg.pinv(asked, 1e-6) @ (np.array([1.0, 0.0, 0.0, 0.0]) - asked @ even))
+
+
+def mean_sigma(time_s: Array, sigma: Array, weights: Array, tau_s: Array, white: float) -> Array:
+    """Sigma of a weighted mean of Gauss-Markov errors of `sigma`, shape (n, m), and white ones; in one pass over time."""
+    part = weights * sigma
+    variance = np.square(part).sum(axis=0) + white**2 * np.square(weights).sum(axis=0)
+    keep = np.exp(-np.diff(time_s)[:, None] / tau_s)
+    before = np.zeros_like(part[0])
+    for i in range(1, len(part)):
+        before = keep[i - 1] * (before + part[i - 1])
+        variance += 2.0 * part[i] * before
+    return np.asarray(np.sqrt(variance))
 
 
 def attitude_factor(

@@ -1,6 +1,6 @@
 """The batch: Gauss-Newton over a stretch of the flight, coarse voxels first, with all that is common to it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -15,7 +15,8 @@ from groundproc.adjustment.anchors import (
     Positions,
     Tie,
     attitude_factor,
-    position_factor,
+    fixes_name,
+    position_factors,
     tie_factor,
 )
 from groundproc.adjustment.factors import (
@@ -90,6 +91,8 @@ class Batch:
         Of these.
     corrections : ndarray, shape (64,)
         Of the lasers, so far; they stay 0 where the clusters have none.
+    told : callable
+        Is called after each step.
     """
 
     path: Path
@@ -107,6 +110,7 @@ class Batch:
     outside_delay_s: Array = field(default_factory=lambda: np.zeros(1))
     corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
     log: list[dict[str, float]] = field(default_factory=list)
+    told: Callable[[], None] = lambda: None
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
         """All Gauss-Newton steps, and the posterior of the last."""
@@ -127,6 +131,8 @@ class Batch:
         free = 1.0 if self.tie is None else 1e-6
         unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]) * free)
         unknowns.add("world.shift", np.full(3, 100.0) * free)
+        for number in range(len(self.positions)):
+            unknowns.add(fixes_name(number), np.full(3, 100.0))
         for unit in self.units:
             names = ["bias", "scale", "shear", "turn"]
             if unit.force_known.any():
@@ -164,6 +170,7 @@ class Batch:
         self.take(unknowns, x)
         moved = self.path.position_m[::STEPS] - before
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(moved - moved.mean(axis=0)).sum(axis=1).mean()))
+        self.told()
         return Posterior(linear, unknowns, factors)
 
     def factors(self, unknowns: Unknowns, weigh: bool) -> list[Factor]:
@@ -178,10 +185,8 @@ class Batch:
             values["ins.lever"] = values["ins.lever"] - self.lever_ins_m
         ins = next((unit for unit in self.units if unit.name == "ins"), None)
         mat = self.mat_sensor_ins if ins is None else turned(ins.values["turn"]) @ self.mat_sensor_ins
-        for positions in self.positions:
-            factor = position_factor(positions, self.path, unknowns)
-            if factor is not None:
-                found.append(factor)
+        for number, positions in enumerate(self.positions):
+            found += position_factors(positions, self.path, unknowns, number)
         turn_name = None if ins is None else "ins.turn"
         for attitudes in self.attitudes:
             factor = attitude_factor(attitudes, self.path, unknowns, mat, self.compass, turn_name)

@@ -302,38 +302,6 @@ def whitened(
     return Factor(name, whiten @ residual.ravel(), (whiten @ matrix).tocsr(), deviation.ravel())
 
 
-def averaged(
-    name: str, residual: Array, matrix: sparse.csr_matrix, time_s: Array, sigma: Array, tau_s: Array, white: float
-) -> Factor:
-    """The same observations as their mean and their differences: the mean lies where the plain one does, whatever its errors are like.
-
-    The best linear estimate of a level under a Gauss-Markov error leans on the first and the last observation. It gains 5 % on the mean
-    where the time constant is right, and loses more where errors are briefer than that.
-
-    Parameters
-    ----------
-    As `whitened`.
-    """
-    count, wide = residual.shape
-    apart_s = np.diff(time_s)[:, None]
-    keep = np.exp(-apart_s / tau_s)
-    share = sigma**-2.0 / (sigma**-2.0).sum(axis=0)
-    deviation = np.empty((count, wide))
-    for axis in range(wide):
-        together = np.exp(-np.abs(time_s[:, None] - time_s) / tau_s[axis])
-        weighted = share[:, axis] * sigma[:, axis]
-        deviation[0, axis] = np.sqrt(weighted @ together @ weighted + white**2 * np.square(share[:, axis]).sum())
-    now, before = sigma[1:], sigma[:-1]
-    deviation[1:] = np.sqrt(now**2 + before**2 - 2.0 * keep * now * before + 2.0 * white**2)
-    # the first row of each axis is the mean, the others a step from the row before
-    size = count * wide
-    row, column, later = np.tile(np.arange(wide), count), np.arange(size), np.arange(wide, size)
-    entries = (np.concatenate([row, later, later]), np.concatenate([column, later, later - wide]))
-    values = np.concatenate([share.ravel(), np.ones(len(later)), -np.ones(len(later))])
-    both = sparse.csr_matrix((values, entries), shape=(size, size))
-    return Factor(name, both @ residual.ravel(), (both @ matrix).tocsr(), deviation.ravel())
-
-
 def prior_factor(unknowns: Unknowns, values: dict[str, Array]) -> Factor:
     """What was known of the globals, and a weak hold on the path's corrections."""
     size = unknowns.size

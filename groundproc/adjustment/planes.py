@@ -15,7 +15,7 @@ from numba import njit, prange
 from groundproc.adjustment.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
 from groundproc.adjustment.odometry import GROUND, observable
 from groundproc.adjustment.rotations import flattest, mat_of_quat
-from groundproc.adjustment.scans import STEP_NS, STEPS, spread, voxel_key
+from groundproc.adjustment.scans import STEPS, spread, voxel_key
 from groundproc.adjustment.spline import Path, basis
 
 Array = npt.NDArray[np.float64]
@@ -208,9 +208,11 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     count = len(clusters)
     world, knot, weights = np.empty((count, 3)), np.empty(count, np.int32), np.empty((count, 4), np.float32)
     rotation = np.empty((count, 9), np.float32)
-    _place(clusters.time_ns, clusters.xyz_m, path.start_ns, path.quat, path.position_m, world, rotation, knot, weights)
-    voxel, voxels = _assign(world, voxel_m, np.full(1 << int(np.ceil(np.log2(max(4 * count, 1 << 12)))), -1, np.int32))
-    order, first = _sorted_by(voxel, voxels)
+    _place(
+        clusters.time_ns, clusters.xyz_m, path.start_ns, path.step_ns, path.quat, path.position_m, world, rotation, knot, weights
+    )  # fmt: skip
+    voxel, voxels = assign(world, voxel_m)
+    order, first = sorted_by(voxel, voxels)
     normals, means, flat = np.empty((voxels, 3)), np.empty((voxels, 3)), np.empty(voxels)
     _planes(first, order, world, clusters.scatter_m2, clusters.count, knot, voxel_m, normals, means, flat)
     keep = _choose(first, order, knot, normals, flat, path.intervals, most)
@@ -235,6 +237,24 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     return rows
 
 
+def placed(clusters: Clusters, path: Path) -> tuple[Array, npt.NDArray[np.float32]]:
+    """Where a path places clusters, shape (n, 3), and the matrices "local from sensor" that it does so with, shape (n, 9)."""
+    count = len(clusters)
+    world, rotation = np.empty((count, 3)), np.empty((count, 9), np.float32)
+    knot, weights = np.empty(count, np.int32), np.empty((count, 4), np.float32)
+    _place(
+        clusters.time_ns, clusters.xyz_m, path.start_ns, path.step_ns, path.quat, path.position_m, world, rotation, knot, weights
+    )  # fmt: skip
+    return world, rotation
+
+
+def assign(world_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.int32], int]:
+    """Number of the voxel of each point, and how many voxels there are."""
+    table = np.full(1 << int(np.ceil(np.log2(max(4 * len(world_m), 1 << 12)))), -1, np.int32)
+    voxel, voxels = _assign(world_m, voxel_m, table)
+    return voxel, int(voxels)
+
+
 def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDArray[np.float32]) -> None:
     """Take out of the rows of each interval the directions that its planes do not show, as the odometry does.
 
@@ -254,13 +274,14 @@ def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDA
 
 @njit(cache=True, nogil=True)
 def _place(
-    time_ns: Any, xyz: Any, start_ns: int, quat: Any, position: Any, world: Any, rotation: Any, knot: Any, weights: Any
-) -> None:
+    time_ns: Any, xyz: Any, start_ns: int, step_ns: int, quat: Any, position: Any, world: Any, rotation: Any, knot: Any,
+    weights: Any,
+) -> None:  # fmt: skip
     m, a, b = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     last = len(quat) - 2
     intervals = (len(quat) - 1) // STEPS
     for n in range(len(time_ns)):
-        g = (time_ns[n] - start_ns) / STEP_NS
+        g = (time_ns[n] - start_ns) / step_ns
         i = min(max(int(g), 0), last)
         u = g - i
         mat_of_quat(quat[i], a)
@@ -297,7 +318,7 @@ def _assign(world: Any, voxel_m: float, table: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _sorted_by(voxel: Any, voxels: int) -> Any:
+def sorted_by(voxel: Any, voxels: int) -> Any:
     """Order of the points by voxel, and where each voxel begins."""
     first = np.zeros(voxels + 1, np.int64)
     for n in range(len(voxel)):

@@ -40,15 +40,18 @@ class Path:
     Attributes
     ----------
     start_ns : int
-        UTC of the first pose; they are STEP_NS apart.
+        UTC of the first pose.
     quat : ndarray, shape (n, 4)
         Local from sensor.
     position_m : ndarray, shape (n, 3)
+    step_ns : int
+        Between two poses; STEPS of them are an interval.
     """
 
     start_ns: int
     quat: Array
     position_m: Array
+    step_ns: int = STEP_NS
 
     @property
     def intervals(self) -> int:
@@ -59,7 +62,7 @@ class Path:
         """The path turned (in the body) and moved by a spline: coefficients of shape (intervals + 3, 6), rotation vector first."""
         quat, position = np.empty_like(self.quat), np.empty_like(self.position_m)
         _correct(self.quat, self.position_m, np.ascontiguousarray(coefficients), quat, position)
-        return Path(self.start_ns, quat, position)
+        return Path(self.start_ns, quat, position, self.step_ns)
 
     def turned(self, mat: Array, shift_m: Array) -> "Path":
         """The path as a rigid body: p -> mat p + shift."""
@@ -68,6 +71,7 @@ class Path:
             self.start_ns,
             frames.quat_multiply(np.repeat(turn, len(self.quat), 0), self.quat),
             self.position_m @ mat.T + shift_m,
+            self.step_ns,
         )
 
 

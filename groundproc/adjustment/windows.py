@@ -1,6 +1,9 @@
-"""Windows of a long flight: each a batch of its own, tied to the one before where they overlap, and joined into one path."""
+"""Windows of a long flight: each a batch of its own, tied to the one before where they overlap, and joined into one path.
 
-from collections.abc import Mapping, Sequence
+What is left between them after that is for `joining`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,9 +16,11 @@ from groundproc.adjustment import lasers
 from groundproc.adjustment.anchors import Attitudes, Positions, Tie
 from groundproc.adjustment.batch import DRAWS, Batch, Posterior, joined, make_unit
 from groundproc.adjustment.factors import H
+from groundproc.adjustment.joining import Stiffness, stiffness_of
 from groundproc.adjustment.motion import ImuTrack, Motion
 from groundproc.adjustment.outside import DELAY, Outside
-from groundproc.adjustment.scans import STEPS
+from groundproc.adjustment.patches import Patches, all_of, patches_of
+from groundproc.adjustment.scans import SLICE_NS, STEPS
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track
 
@@ -86,6 +91,9 @@ class Window:
         Of the globals asked for exactly, without what a gyro's axes may differ from its board's.
     corrections : tuple of (ndarray, ndarray), optional
         Of the lasers, shape (64,), and their covariance.
+    seen : Seen or None
+        What the joining needs of it; a window that is the whole flight is not joined, and its sigmas are those of the whole. Those of
+        the others are what they do not know of themselves.
     """
 
     first: int
@@ -98,12 +106,31 @@ class Window:
     log: list[dict[str, float]]
     covariance: Array | None = None
     corrections: tuple[Array, Array] | None = None
+    seen: "Seen | None" = None
+
+
+@dataclass(slots=True)
+class Seen:
+    """What is kept of a window for the joining: some megabytes.
+
+    Attributes
+    ----------
+    patches : Patches
+    stiffness : Stiffness
+    """
+
+    patches: Patches
+    stiffness: Stiffness
 
 
 def adjust_window(
-    track: Track, motion: Motion, sources: Sources, first: int, last: int, before: Sequence[Window]
-) -> Window:
-    """Adjust slices `first` to `last` of a track, tied to the last of the windows `before`."""
+    track: Track, motion: Motion, sources: Sources, first: int, last: int, before: Sequence[Window], *, more: bool,
+    told: Callable[[], None] = lambda: None,
+) -> Window:  # fmt: skip
+    """Adjust slices `first` to `last` of a track, tied to the last of the windows `before`; whether there is `more` to come.
+
+    `told` is called after each step.
+    """
     path, tie = track.path(motion, first, last), None
     if before:
         previous = before[-1]
@@ -124,9 +151,10 @@ def adjust_window(
         )
         for name, unit in sources.units.items()
     ]
+    gathered = track.gathered(first, last, sources.lasers_apart)
     batch = Batch(
         path,
-        track.gathered(first, last, sources.lasers_apart),
+        gathered,
         units,
         dict(sources.units),
         sources.positions,
@@ -135,20 +163,25 @@ def adjust_window(
         to_ins,
         tie=tie,
         outside=sources.outside,
+        told=told,
     )
     posterior = batch.run()
     draws = posterior.draws(DRAWS)
+    values, seen = _values(batch, posterior, draws), None
+    if before or more:
+        stiffness = stiffness_of(batch.path, posterior, draws, RELATIVE)
+        seen = Seen(patches_of(gathered, batch.path, len(before)), stiffness)
+        # how the whole lies is asked for when all windows are joined
+        for name in ("world.turn", "world.shift"):
+            draws[:, posterior.unknowns.names[name]] = 0.0
     position, attitude = _sigmas(batch.path, posterior, draws, mat, lever, motion.rate_density)
-    if before:
-        old = before[-1]
-        position = np.hypot(position, old.sigma_position_m[old.own])
-        attitude = np.hypot(attitude, old.sigma_attitude_rad[old.own])
-    values = _values(batch, posterior, draws)
     exact = posterior.covariance(sources.exact) if sources.exact and set(sources.exact) <= set(values) else None
     corrections = None
     if sources.lasers_apart:
         corrections = batch.corrections, lasers.stretched(posterior.covariance(lasers.NAMES), RELATIVE)
-    return Window(first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections)
+    return Window(
+        first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections, seen
+    )
 
 
 def corrections_over(windows: Sequence[Window]) -> tuple[Array, Array] | None:
@@ -231,3 +264,23 @@ def joined_path(windows: Sequence[Window]) -> Path:
             np.concatenate([path.position_m[:begin], place, window.path.position_m[shared:]]),
         )
     return path
+
+
+def all_patches(windows: Sequence[Window]) -> Patches:
+    """What all windows saw; of an overlap each says what is nearer to its own middle."""
+    parts = []
+    for number, window in enumerate(windows):
+        if window.seen is None:
+            continue
+        begin = window.first + (OVERLAP // 2 if number else 0)
+        end = windows[number + 1].first + OVERLAP // 2 if number + 1 < len(windows) else window.last
+        slot = window.first + (window.seen.patches.clusters.time_ns - window.path.start_ns) // SLICE_NS
+        parts.append(window.seen.patches.of((slot >= begin) & (slot < end)))
+    return all_of(parts)
+
+
+def whole_stiffness(windows: Sequence[Window]) -> Stiffness:
+    """Stiffness of all slices; the tilt is as well known as the first window's, which is tied to nothing."""
+    parts = [(window, window.seen.stiffness) for window in windows if window.seen is not None]
+    turn, shift = (np.concatenate([(s.turn, s.shift)[i][: w.own] for w, s in parts]) for i in range(2))
+    return Stiffness(turn, shift, parts[0][1].tilt)

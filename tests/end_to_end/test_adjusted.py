@@ -13,6 +13,7 @@ from flightlog.logfile import LogReader, LogWriter
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.adjustment import adjusted, windows
+from groundproc.adjustment.track import Track
 from groundproc.flight import read_flight
 from groundproc.survey import Survey
 from groundproc.timeline import legs
@@ -70,13 +71,21 @@ def autopilots(flight: Any) -> Judged:
 
 
 @contextmanager
-def short_windows(slices: int, overlap: int) -> Iterator[None]:
-    """Windows of a long flight, on a short one."""
+def short_windows(slices: int, overlap: int) -> Iterator[list[int]]:
+    """Windows of a long flight, on a short one; gives the numbers of slices whose clusters are held when a window is adjusted."""
+    held: list[int] = []
+    adjust_window = windows.adjust_window
+
+    def counted(track: Track, *rest: Any, **named: Any) -> Any:
+        held.append(sum(len(clusters) > 0 for clusters in track.clusters))
+        return adjust_window(track, *rest, **named)
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adjusted, "adjust_window", counted)
         patch.setattr(adjusted, "WINDOW", slices)
         for module in (adjusted, windows):
             patch.setattr(module, "OVERLAP", overlap)
-        yield
+        yield held
 
 
 def test_the_whole_flight_is_right_to_the_sensors_noise(whole: Judged, autopilots: Judged) -> None:
@@ -108,10 +117,12 @@ def test_what_is_common_to_the_flight_is_found_within_its_sigma(flight: Any, who
 
 
 def test_the_same_flight_in_windows_is_as_good(flight: Any, whole: Judged) -> None:
-    """Four windows of 6 s with 2 s in common."""
-    with short_windows(60, 20):
-        made = judged(flight.folder, Survey(method="adjusted"))
-    assert len(made.estimate.report["windows"]) >= 4
+    """Five windows of 6 s with 2 s in common: the same path, on the same place, and a cloud as thin."""
+    with short_windows(60, 20) as held:
+        made = judged(flight.folder, Survey(method="adjusted"), cloud=True)
+    assert len(made.estimate.report["windows"]) == len(held) >= 4
+    # memory: a window's clusters and no more, however many windows there were before
+    assert max(held) <= 60
     assert made.estimate.warning == ""
     assert made.figures["ate_m"] <= 0.02
     assert made.figures["rotation_rms_deg"] <= 0.06
@@ -120,6 +131,15 @@ def test_the_same_flight_in_windows_is_as_good(flight: Any, whole: Judged) -> No
     # no step where windows meet: 5 m/s and what changes it in 5 ms
     steps = np.linalg.norm(np.diff(made.estimate.trajectory.position_m, n=2, axis=0), axis=1)
     assert steps.max() < 0.005
+    assert made.figures["cloud_floor_ratio"] <= 1.05 * whole.figures["cloud_floor_ratio"]
+    # both are placed by the mean of all fixes, and turned by their course and the compass; lever arms are known to 5 cm before
+    ours, theirs = made.estimate.trajectory, whole.estimate.trajectory
+    np.testing.assert_allclose(ours.position_m.mean(axis=0), theirs.position_m.mean(axis=0), atol=0.2)
+    off = np.abs(ours.position_m - theirs.position_m)
+    assert (off < 2.0 * np.hypot(ours.sigma_position_m, theirs.sigma_position_m)).all()
+    # nothing of the joining is kept back, and its figures are in the report
+    assert made.estimate.report["joining"]["rounds"][-1]["apart_m"] < 0.005
+    assert whole.estimate.report["joining"] is None
 
 
 def test_nothing_of_the_future_costs_centimetres(flight: Any, whole: Judged) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.sparse import csr_matrix
 from scipy.stats import multivariate_normal
 
 from flightlog import frames
@@ -21,7 +20,6 @@ from groundproc.adjustment.factors import (
     RowBuilder,
     Unit,
     Unknowns,
-    averaged,
     eye,
     force_factor,
     normal_equations,
@@ -266,21 +264,20 @@ def attitudes(noise_rad: float = 0.01) -> Attitudes:
 
 
 def position_factor(path: Path, unknowns: Unknowns) -> Factor:
-    factor = anchors.position_factor(positions(), path, unknowns)
-    assert factor is not None
-    return factor
+    (course,) = anchors.position_factors(positions(), path, unknowns)
+    return course
 
 
 def test_true_positions_leave_nothing_and_their_errors_stand_in_the_residual(path: Path) -> None:
     given = positions()
     true = replace(given, position_m=position_at((given.time_ns - START_NS) * 1e-9) + frames.mat_from_quat(
         attitude_at((given.time_ns - START_NS) * 1e-9)) @ LEVER)  # fmt: skip
-    factor = anchors.position_factor(true, path, unknowns_of())
-    assert factor is not None
+    (factor,) = anchors.position_factors(true, path, unknowns_of())
     # straight between grid points 5 ms apart
     assert np.abs(factor.residual).max() < 1e-4
-    moved = anchors.position_factor(replace(true, position_m=true.position_m - [3.0, 0.0, 0.0]), path, unknowns_of())
-    assert moved is not None
+    (moved,) = anchors.position_factors(
+        replace(true, position_m=true.position_m - [3.0, 0.0, 0.0]), path, unknowns_of()
+    )
     assert moved.residual[0] == pytest.approx(3.0, abs=1e-4)
 
 
@@ -347,7 +344,7 @@ def test_what_a_tie_says_is_linear_as_stated(path: Path) -> None:
 
 def test_too_few_observations_are_none(path: Path) -> None:
     far = replace(positions(), time_ns=positions().time_ns + 10**12)
-    assert anchors.position_factor(far, path, unknowns_of()) is None
+    assert anchors.position_factors(far, path, unknowns_of()) == []
     late = replace(attitudes(), time_ns=attitudes().time_ns + 10**12)
     assert anchors.attitude_factor(late, path, unknowns_of("compass"), np.eye(3), COMPASS, None) is None
 
@@ -391,34 +388,6 @@ def test_white_noise_on_top_costs_at_most_some_of_the_information() -> None:
     stated = (weighed.T @ weighed)[0, 0]
     dense = gauss_markov(time_s, 2.0, 60.0) + 0.01 * np.eye(60)
     assert stated == pytest.approx(np.ones(60) @ np.linalg.solve(dense, np.ones(60)), rel=0.2)
-
-
-def test_averaged_positions_level_where_their_plain_mean_is_and_say_how_well() -> None:
-    """One free level under errors that last: it ends at the mean, with the sigma that the dense covariance of the process gives it."""
-    rng = np.random.default_rng(3)
-    time_s = np.cumsum(rng.uniform(0.5, 4.0, 40))
-    residual = rng.normal(size=(40, 2)) * 3.0
-    level = csr_matrix(np.tile(np.eye(2), (40, 1)))
-    sigma, tau_s, white = np.full((40, 2), 2.5), np.array([60.0, 5.0]), 0.1
-    factor = averaged("x", residual, level, time_s, sigma, tau_s, white)
-    normal, gradient = normal_equations([factor])
-    found = -np.linalg.solve(normal.toarray(), gradient)
-    np.testing.assert_allclose(found, -residual.mean(axis=0), atol=1e-9)
-    apart_s = np.abs(time_s[:, None] - time_s)
-    for axis in range(2):
-        dense = 2.5**2 * np.exp(-apart_s / tau_s[axis]) + white**2 * np.eye(40)
-        assert normal[axis, axis] ** -0.5 == pytest.approx(np.sqrt(dense.mean()), rel=1e-9)
-        steps = np.diff(np.eye(40), axis=0)
-        expected = np.sqrt(np.diag(steps @ dense @ steps.T))
-        np.testing.assert_allclose(factor.sigma.reshape(40, 2)[1:, axis], expected, rtol=1e-9)
-
-
-def test_averaged_positions_of_unequal_worth_are_weighed() -> None:
-    residual, level = np.array([[1.0], [5.0], [2.0]]), csr_matrix(np.ones((3, 1)))
-    sigma = np.array([[1.0], [10.0], [1.0]])
-    factor = averaged("x", residual, level, np.array([0.0, 1.0, 2.0]), sigma, np.array([60.0]), 0.0)
-    normal, gradient = normal_equations([factor])
-    assert -gradient[0] / normal[0, 0] == pytest.approx(-(1.0 + 0.05 + 2.0) / 2.01)
 
 
 def test_normal_equations_are_those_of_the_whitened_rows(path: Path, unit: Unit) -> None:

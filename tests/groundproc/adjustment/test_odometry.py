@@ -13,6 +13,7 @@ from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.adjustment.motion import Motion
 from groundproc.adjustment.odometry import GYRO, POSITION, ROTATION, STATES, VELOCITY, Odometry, State, observable
 from groundproc.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
+from groundproc.adjustment.track import LOST_M, Bearing
 
 Array = npt.NDArray[np.float64]
 START_NS = 1_779_000_000_000_000_000
@@ -197,3 +198,44 @@ def test_inertial_data_that_end_are_not_extrapolated() -> None:
     odometry = Odometry(start(), motion(), 0, 0.5)
     with pytest.raises(IndexError, match="beyond the inertial data"):
         odometry.propagate(SLICES)
+
+
+# Bearing of the map --------------------------------------------------------------------------------------------------
+
+
+def along_a_street(off_deg: float, speed_off: float = 1.0) -> tuple[Array, Array]:
+    """A way as the odometry has it with a heading that is off, and the fixes beside the true one: 60 s at 5 m/s, there and back."""
+    seconds = np.arange(0.0, 120.0, 1.0 / 3.0)
+    north = 5.0 * np.minimum(seconds, 120.0 - seconds)
+    true = np.stack([0.0 * north, north, 7.0 + 0.0 * north], axis=1)
+    rng, error = np.random.default_rng(9), np.zeros((len(seconds), 3))
+    keep = np.exp(-1.0 / 3.0 / 60.0)
+    error[0] = 2.5 * rng.normal(size=3)
+    for i in range(1, len(error)):
+        error[i] = keep * error[i - 1] + 2.5 * np.sqrt(1 - keep**2) * rng.normal(size=3)
+    angle = np.deg2rad(off_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    return error[0] + speed_off * true @ turn.T, true + error
+
+
+@pytest.mark.parametrize("off_deg", [-12.0, 0.0, 6.0])
+def test_a_heading_that_is_off_is_not_a_lost_way(off_deg: float) -> None:
+    """At the end of a street of 300 m the raw fixes lie up to 60 m beside the way; on the map's axes they keep to their own errors."""
+    way, fixes = along_a_street(off_deg)
+    bearing = Bearing(way[0].copy())
+    off = np.array([bearing.on_map(at, fix, 2.5) - at for at, fix in zip(way, fixes, strict=True)])
+    raw = np.linalg.norm(fixes - way, axis=1)
+    if off_deg:
+        assert raw.max() > 30.0
+    assert np.abs(off).max() < LOST_M
+    # 8 m: three sigma of a fix, as far as it differs from the first one
+    assert np.abs(off[90:]).max() < 8.0 + 2.0
+
+
+def test_a_way_that_stands_still_or_turns_back_is_lost() -> None:
+    """What no turn of the map explains is still seen."""
+    for speed_off in (0.0, -1.0):
+        way, fixes = along_a_street(0.0, speed_off)
+        bearing = Bearing(way[0].copy())
+        off = np.array([bearing.on_map(at, fix, 2.5) - at for at, fix in zip(way, fixes, strict=True)])
+        assert (np.abs(off[60:180]).max(axis=1) > LOST_M).all()
