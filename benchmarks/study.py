@@ -225,7 +225,7 @@ def fly(
         shutil.rmtree(folder)
     ins = found.get("ins", {})
     return {
-        "flight": trial.flight, "scene": truth["scene"], "seed": trial.seed, "seconds": trial.seconds, "changes": trial.changes,
+        "flight": trial.flight, "scene": truth["scene"], "seed": trial.seed, "seconds": truth["duration_s"], "changes": trial.changes,
         "methods": {method: measured(found[method], ins, truth) for method in methods},
     }  # fmt: skip
 
