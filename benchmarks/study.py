@@ -102,7 +102,8 @@ class Promise:
     form : str
         How the table writes it.
     most, most_slow : float
-        Largest that holds the promise, with an autopilot's gyro of 50 Hz and with a slower one.
+        Largest that holds the promise, with an autopilot's gyro of 50 Hz and with a slower one. Where two means of a flight are compared
+        they may differ by 2 %: they are of different instants.
     """
 
     key: str
@@ -133,8 +134,8 @@ PROMISES: Final = (
     Promise("scale_z", "scales / sigma", ".1f", 3.0, 3.0),
     Promise("position_beyond_2_sigma", "position beyond 2 sigma", ".2f", 0.05, 0.05),
     Promise("attitude_beyond_2_sigma", "attitude beyond 2 sigma", ".2f", 0.05, 0.05),
-    Promise("mean_over_fixes", "mean error / that of the fixes", ".2f", 1.0, 1.0),
-    Promise("ate_over_ins", "trajectory / ins", ".3f", 1.0, 1.0),
+    Promise("mean_over_fixes", "mean error / that of the fixes", ".2f", 1.02, 1.02),
+    Promise("ate_over_ins", "trajectory / ins", ".3f", 1.02, 1.02),
 )
 
 

@@ -91,7 +91,7 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     mount = main.mount(given.mount)
     warnings = [w for run in made for w in run.warnings()] + [str(reason) for reason in reasons]
     corrections = main.corrections()
-    trajectory = joined([run.trajectory(given, mount) if not run.is_blind() else own_part(start, run) for run in made])
+    trajectory = joined([own_part(start, run) if run.is_worse() else run.trajectory(given, mount) for run in made])
     return Estimate(
         trajectory,
         mount,
@@ -207,11 +207,15 @@ class Run:
             found.append(
                 f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
             )
-        slid = max(window.log[-1]["position_drift"] for window in self.windows)
-        if slid > 6.0:
+        slid = self.slid_sigmas()
+        if slid > SLID_SIGMAS:
             found.append(
-                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under 6; the lidar may "
-                "have been misled there"
+                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under {SLID_SIGMAS:.0f}; "
+                + (
+                    "the trajectory is what the adjustment began from"
+                    if self.is_misled()
+                    else "the lidar may have been misled there"
+                )
             )
         off = max(window.log[-1].get("position_rms", 0.0) for window in self.windows)
         if off > 4.0:
@@ -234,8 +238,22 @@ class Run:
         """Whether the lidar saw nothing for most of the flight: without better positions it then knows no more than what it began from."""
         return self.blind_s() > 0.5 * len(self.track) * H and not self.sources.outside
 
+    def slid_sigmas(self) -> float:
+        """How far the path slid away from the fixes within `DRIFT_S`, in sigmas of such a mean."""
+        return max(window.log[-1]["position_drift"] for window in self.windows)
+
+    def is_misled(self) -> bool:
+        """Whether the odometry lost its way and the batch did not find it again: the path goes where the fixes do not."""
+        return self.track.restarts > 0 and self.slid_sigmas() > SLID_SIGMAS and not self.sources.outside
+
+    def is_worse(self) -> bool:
+        """Whether what the adjustment began from is better than what it made of it."""
+        return self.is_blind() or self.is_misled()
+
     def note(self) -> str:
         """What a reader must know though nothing is wrong."""
+        if self.is_misled():
+            return "the lidar misled the adjustment: the trajectory is what it began from"
         if self.is_blind():
             return "the lidar saw next to no planes for most of the flight: the trajectory is what the adjustment began from"
         blind, whole = self.blind_s(), len(self.track) * H
@@ -298,6 +316,8 @@ class Run:
         }
 
 
+SLID_SIGMAS: Final = 6.0
+"""A path that slides away from the fixes by more is worth a warning."""
 UNSETTLED_M: Final = 0.03
 """A last step larger than this is worth a warning."""
 
@@ -367,7 +387,7 @@ class CausalRun:
         """As they were given."""
         return nominal
 
-    def is_blind(self) -> bool:
+    def is_worse(self) -> bool:
         """It is what it is."""
         return False
 

@@ -113,7 +113,7 @@ def sheet_of(run: Run | CausalRun, given: Given, trajectory: Trajectory) -> Shee
     log = run.windows[-1].log[-1] if isinstance(run, Run) else {}
     parts = [f"{len(track) * 0.1:.0f} s", "causal" if isinstance(run, CausalRun) else f"{len(run.windows)} window(s)"]
     parts += [f"{100.0 * blind:.0f} % without planes", f"{track.restarts} restarts"]
-    if run.is_blind():
+    if run.is_worse():
         parts[3] += "; the trajectory is what the adjustment began from"
     if log:
         parts.append(f"lidar chi-square {log['chi_square']:.2f}")
