@@ -196,6 +196,12 @@ class Projection:
         east, north = self._transformer.transform(longitude, latitude)
         return np.stack([east, north, height], axis=-1)
 
+    def local(self, map_m: Array) -> Array:
+        """Local coordinates [m] of easting, northing, height, shape (n, 3), by PROJ itself; not finite where there are none."""
+        east, north, height = np.moveaxis(np.asarray(map_m), -1, 0)
+        longitude, latitude = self._transformer.transform(east, north, direction="INVERSE")
+        return self.frame.from_geodetic(np.asarray(latitude), np.asarray(longitude), height)
+
     def polynomial(self, low_m: Array, high_m: Array) -> Polynomial:
         """Fit the box between two corners, shape (3,) each [local m].
 

@@ -50,6 +50,11 @@ class Survey:
         "corrections of the 32 lasers: a file from `swath calibrate --lasers`, looked for beside this one; estimate: method adjusted "
         "finds them on this flight; null: the manual's table",
     )
+    control: str | None = option(
+        None,
+        "method adjusted: control points and planes (CSV: x, y, z, sigma; name, use, nx, ny, nz, radius) in coordinates and heights of "
+        "the output, looked for beside this file; null: none",
+    )
     pose_grid_ms: float | None = option(
         None,
         "method ins: one pose for so many milliseconds, as the source did with 10; null: a pose for every firing",

@@ -19,6 +19,7 @@ from flightlog.mount import Mount
 from groundproc.adjustment.anchors import Attitudes, Positions, within
 from groundproc.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
 from groundproc.adjustment.beginning import BEGINNING, redo_beginning
+from groundproc.adjustment.control import control_report, control_warnings
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.joining import Joined, joining
 from groundproc.adjustment.lasers import Corrections
@@ -35,6 +36,7 @@ from groundproc.adjustment.windows import (
     Window,
     adjust_window,
     all_patches,
+    control_clusters,
     corrections_over,
     joined_path,
     whole_stiffness,
@@ -46,7 +48,7 @@ from groundproc.geodesy import LocalFrame
 from groundproc.timeline import Leg
 from groundproc.trajectory import ins
 from groundproc.trajectory.method import Estimate, Given, Progress
-from groundproc.trajectory.outside import surveyed
+from groundproc.trajectory.outside import surveyed, surveyed_control
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
@@ -228,7 +230,11 @@ class Run:
                 f"the path differs from {self.sources.outside[0].source} by {off:.1f} times what its sigmas explain though its errors "
                 "last, expected under 1; sigmas, lever arm, heights or time scale of that file may be wrong"
             )
-        return found
+        return found + control_warnings(self.sources.control, self.control())
+
+    def control(self) -> list[list[dict[str, Any]]]:
+        """What is to be said of each control point: by the joining, or by the one window."""
+        return [window.control for window in self.windows] if self.joined is None else [self.joined.control]
 
     def blind_s(self) -> float:
         """Seconds in which the lidar saw next to no planes, the first one left out: there is no map yet."""
@@ -296,6 +302,7 @@ class Run:
             ],
             "joining": None if self.joined is None else self.joined.report(),
             "estimated": values,
+            "control": control_report(self.sources.control, self.control()),
             "outside": [
                 {
                     "source": outside.source,
@@ -466,6 +473,7 @@ def adjust_run(
         exact,
         [outside_track(fixes, mat, lever, legs[0].utc) for fixes in surveyed(given)],
         given.survey.lasers == ESTIMATE,
+        surveyed_control(given),
     )
     tracker = Tracker(
         motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
@@ -518,7 +526,7 @@ def joined_run(windows: list[Window], track: Track, motion: Motion, sources: Sou
     run.joined = joining(
         run.path, all_patches(windows), whole_stiffness(windows), sources.positions, sources.attitudes,
         boresight @ sources.mat_ins_lidar.T, values["compass"][0], sources.outside,
-        float(values[DELAY][0][0]) if DELAY in values else 0.0,
+        float(values[DELAY][0][0]) if DELAY in values else 0.0, sources.control, control_clusters(windows),
     ).run()  # fmt: skip
     run.path = run.joined.applied(run.path)
     for window in windows:

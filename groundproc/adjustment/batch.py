@@ -19,6 +19,7 @@ from groundproc.adjustment.anchors import (
     position_factors,
     tie_factor,
 )
+from groundproc.adjustment.control import Held, held_to
 from groundproc.adjustment.factors import (
     Factor,
     H,
@@ -35,6 +36,7 @@ from groundproc.adjustment.planes import Clusters, rows_of
 from groundproc.adjustment.scans import STEPS
 from groundproc.adjustment.solve import Problem, problem
 from groundproc.adjustment.spline import Path
+from groundproc.control import ControlPoint
 
 Array = npt.NDArray[np.float64]
 
@@ -93,6 +95,10 @@ class Batch:
         Of the lasers, so far; they stay 0 where the clusters have none.
     told : callable
         Is called after each step.
+    control : sequence of ControlPoint
+        In the local frame.
+    held : Held, optional
+        What of it the map meets.
     """
 
     path: Path
@@ -109,6 +115,8 @@ class Batch:
     outside: Sequence[Outside] = ()
     outside_delay_s: Array = field(default_factory=lambda: np.zeros(1))
     corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
+    control: Sequence[ControlPoint] = ()
+    held: Held | None = None
     log: list[dict[str, float]] = field(default_factory=list)
     told: Callable[[], None] = lambda: None
 
@@ -120,6 +128,19 @@ class Batch:
             if self.log[-1]["moved_m"] < SETTLED_M:
                 break
             last = self.step(*rounds[-1], weigh=False)
+        return self.hold(last, *rounds[-1]) if self.control and self.tie is None else last
+
+    def hold(self, last: "Posterior", voxel_m: float, cut: bool) -> "Posterior":
+        """Lay a map that is right in itself on the control as a whole, and adjust it with that."""
+        covariance = last.covariance(("world.turn", "world.shift"))
+        self.held = held_to(self.control, self.clusters, self.path, covariance, DEFLATION)
+        if self.held is None:
+            return last
+        self.path = self.path.turned(*self.held.datum.placing.as_turn())
+        for number in range(MORE_ROUNDS):
+            last = self.step(voxel_m, cut, weigh=False)
+            if number and self.log[-1]["moved_m"] < SETTLED_M:
+                break
         return last
 
     def unknowns(self) -> Unknowns:
@@ -194,6 +215,8 @@ class Batch:
                 found.append(factor)
         for outside in self.outside:
             found += outside_factors(outside, self.path, unknowns, float(self.outside_delay_s[0]), mat, turn_name)
+        if self.held is not None and (control := self.held.factor(self.clusters, self.path, unknowns)) is not None:
+            found.append(control)
         if self.tie is not None:
             found.append(tie_factor(self.tie, self.path, unknowns))
         found.append(prior_factor(unknowns, values))

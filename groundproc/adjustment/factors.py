@@ -108,12 +108,15 @@ class Factor:
     residual : ndarray, shape (m,)
     matrix : csr_matrix, shape (m, unknowns)
     sigma : ndarray, shape (m,)
+    wide : bool
+        Whether single rows touch much of the path: they are few, and kept out of the sparse normal matrix.
     """
 
     name: str
     residual: Array
     matrix: sparse.csr_matrix
     sigma: Array
+    wide: bool = False
 
     def rms(self) -> float:
         """Root mean square of the residuals in sigmas."""
@@ -315,11 +318,12 @@ def prior_factor(unknowns: Unknowns, values: dict[str, Array]) -> Factor:
 
 
 def normal_equations(factors: Sequence[Factor]) -> tuple[sparse.csc_matrix, Array]:
-    """Normal matrix and half gradient of all factors."""
+    """Normal matrix of all factors but the wide ones, and half gradient of all."""
     size = factors[0].matrix.shape[1]
     total, gradient = sparse.csc_matrix((size, size)), np.zeros(size)
     for factor in factors:
         weighted = sparse.diags(1.0 / factor.sigma) @ factor.matrix
-        total = total + (weighted.T @ weighted).tocsc()
+        if not factor.wide:
+            total = total + (weighted.T @ weighted).tocsc()
         gradient += weighted.T @ (factor.residual / factor.sigma)
     return total, gradient

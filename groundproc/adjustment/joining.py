@@ -20,13 +20,15 @@ from scipy.ndimage import uniform_filter1d
 from flightlog import frames
 from groundproc.adjustment.anchors import Attitudes, Positions, attitude_factor, fixes_name, position_factors
 from groundproc.adjustment.batch import COMPASS_PRIOR, DEFLATION, DRAWS, Posterior, turned
+from groundproc.adjustment.control import Held, held_to
 from groundproc.adjustment.factors import Factor, H, RowBuilder, Unknowns, cross, eye, prior_factor, whitened
 from groundproc.adjustment.outside import Outside, outside_factors
 from groundproc.adjustment.patches import Patches, coarse
-from groundproc.adjustment.planes import Rows, placed, rows_of
+from groundproc.adjustment.planes import Clusters, Rows, placed, rows_of
 from groundproc.adjustment.scans import STEPS
 from groundproc.adjustment.solve import problem
 from groundproc.adjustment.spline import Path, basis
+from groundproc.control import ControlPoint
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -122,6 +124,11 @@ class Joining:
     outside : sequence of Outside
     outside_delay_s : float
         Of these, as the windows found it.
+    control : sequence of ControlPoint
+    control_clusters : Clusters, optional
+        What may be of a surface there.
+    held : Held, optional
+        What of the control the map meets.
     log : list of dict
         What each step said.
     """
@@ -136,13 +143,30 @@ class Joining:
     compass: Array
     outside: Sequence[Outside] = ()
     outside_delay_s: float = 0.0
+    control: Sequence[ControlPoint] = ()
+    control_clusters: Clusters | None = None
+    held: Held | None = None
     log: list[dict[str, float]] = field(default_factory=list)
 
     def run(self) -> "Joined":
         """All steps, and the posterior of the last."""
         for voxel_m, cut in ROUNDS:
             last = self.step(voxel_m, cut)
+        if self.control and self.control_clusters is not None:
+            last = self._hold(last)
         return self._joined(last, last.draws(DRAWS))
+
+    def _hold(self, last: Posterior) -> Posterior:
+        """Lay the flight, which is right in itself, on the control as a whole, and adjust it with that."""
+        assert self.control_clusters is not None
+        covariance = last.covariance(("world.turn", "world.shift"))
+        self.held = held_to(self.control, self.control_clusters, self.path, covariance, DEFLATION)
+        if self.held is None:
+            return last
+        self.path = self.path.turned(*self.held.datum.placing.as_turn())
+        for voxel_m, cut in ROUNDS[-2:]:
+            last = self.step(voxel_m, cut)
+        return last
 
     def unknowns(self) -> Unknowns:
         """A slow path, the whole's turn and shift, the mean error of the fixes and the compass."""
@@ -185,6 +209,9 @@ class Joining:
                 found.append(factor)
         for outside in self.outside:
             found += outside_factors(outside, self.path, unknowns, self.outside_delay_s, self.mat_sensor_ins, None)
+        if self.held is not None and self.control_clusters is not None:
+            control = self.held.factor(self.control_clusters, self.path, unknowns)
+            found += [] if control is None else [control]
         found.append(prior_factor(unknowns, {"compass": self.compass}))
         return found
 
@@ -209,7 +236,10 @@ class Joining:
             for part in (position, attitude)
         ]
         sigma_compass = np.sqrt(np.square(draws[:, names["compass"]]).mean(axis=0))
-        return Joined(self.begin, self.path, sigmas[0], sigmas[1], (self.compass, sigma_compass), self.log)
+        told: list[dict[str, Any]] = []
+        if self.held is not None and self.control_clusters is not None:
+            told = self.held.report(self.control_clusters, self.path)
+        return Joined(self.begin, self.path, sigmas[0], sigmas[1], (self.compass, sigma_compass), self.log, told)
 
 
 @dataclass(slots=True)
@@ -225,6 +255,8 @@ class Joined:
     compass : tuple of ndarray
         The curve and its sigma [rad].
     log : list of dict
+    control : list of dict
+        What is to be said of each control point; empty where none was met.
     """
 
     begin: Path
@@ -233,6 +265,7 @@ class Joined:
     sigma_attitude_rad: Array
     compass: tuple[Array, Array]
     log: list[dict[str, float]]
+    control: list[dict[str, Any]] = field(default_factory=list)
 
     def applied(self, path: Path) -> Path:
         """The path that was begun with, on its fine grid, as corrected."""
@@ -253,12 +286,14 @@ class Joined:
 def joining(
     path: Path, patches: Patches, stiffness: Stiffness, positions: Sequence[Positions], attitudes: Sequence[Attitudes],
     mat_sensor_ins: Array, compass: Array, outside: Sequence[Outside] = (), outside_delay_s: float = 0.0,
+    control: Sequence[ControlPoint] = (), control_clusters: Clusters | None = None,
 ) -> Joining:  # fmt: skip
     """Set the last adjustment up on the windows' joined path."""
     begin = padded(coarse(path))
     return Joining(
-        begin, begin, patches, stiffness, positions, attitudes, mat_sensor_ins, compass, outside, outside_delay_s
-    )
+        begin, begin, patches, stiffness, positions, attitudes, mat_sensor_ins, compass, outside, outside_delay_s, control,
+        control_clusters,
+    )  # fmt: skip
 
 
 def padded(path: Path) -> Path:

@@ -50,6 +50,8 @@ class Problem:
         Of everything else and a share of the lidar's information with the planes fixed: the preconditioner's fine part.
     coarse : Coarse
         Its coarse part.
+    wide : Wide, optional
+        Rows that are in the gradient and not in `normal`.
     """
 
     rows: Rows
@@ -58,18 +60,21 @@ class Problem:
     gradient: Array
     factor: Factorisation
     coarse: Coarse
+    wide: "Wide | None" = None
 
     def apply(self, vector: Array) -> Array:
         """The whole normal matrix times a vector."""
         size = self.rows.size
         out = self.normal @ vector
+        if self.wide is not None:
+            out += self.wide.rows.T @ (self.wide.rows @ vector)
         out[:size] += self.rows.apply(vector[:size]) / self.deflation
         return np.asarray(out)
 
     def solve(self, right: Array, enough: float = ENOUGH) -> tuple[Array, int]:
         """Normal matrix x = right, by preconditioned conjugate gradients until less than `enough` is missing; and the steps it took."""
         x, r = np.zeros_like(right), right.copy()
-        z = self._near(r)
+        z = self.near(r)
         p, rz = z.copy(), float(r @ z)
         gains: list[float] = []
         for step in range(1, MOST_STEPS + 1):
@@ -80,14 +85,15 @@ class Problem:
             gains.append(alpha * rz)
             if step >= DELAY_STEPS and sum(gains[-DELAY_STEPS:]) < enough:
                 return x, step
-            z = self._near(r)
+            z = self.near(r)
             before, rz = rz, float(r @ z)
             p = z + (rz / before) * p
         return x, MOST_STEPS
 
-    def _near(self, right: Array) -> Array:
+    def near(self, right: Array) -> Array:
         """The preconditioner: nearly the inverse times a vector."""
-        return np.asarray(self.factor.solve(right) + self.coarse.solve(right))
+        found = self.factor.solve(right) + self.coarse.solve(right)
+        return np.asarray(found if self.wide is None else self.wide.bordered(found))
 
 
 def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation: float, path: Path) -> Problem:
@@ -101,7 +107,33 @@ def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation
         (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
     )
     by_row = normal.tocsr()
-    return Problem(rows, deflation, by_row, gradient, fine, coarse_of(rows, deflation, by_row, path))
+    found = Problem(rows, deflation, by_row, gradient, fine, coarse_of(rows, deflation, by_row, path))
+    wide = [sparse.diags(1.0 / each.sigma) @ each.matrix for each in factors if each.wide]
+    if wide:
+        found.wide = Wide(sparse.vstack(wide, format="csr"), found)
+    return found
+
+
+class Wide:
+    """Some rows that touch much of the path, added to a problem and to its preconditioner (Woodbury).
+
+    Parameters
+    ----------
+    rows : csr_matrix, shape (m, unknowns)
+        Of unit noise.
+    problem : Problem
+        Without them.
+    """
+
+    def __init__(self, rows: sparse.csr_matrix, problem: Problem) -> None:
+        dense = rows.toarray()
+        self.rows = rows
+        self._columns = np.stack([problem.near(row) for row in dense], axis=1)
+        self._small = np.linalg.inv(np.eye(len(dense)) + dense @ self._columns)
+
+    def bordered(self, found: Array) -> Array:
+        """What the preconditioner makes of a vector, of what it makes without these rows."""
+        return np.asarray(found - self._columns @ (self._small @ (self.rows @ found)))
 
 
 def _sparse_corner(corner: Array, start: int, size: int) -> sparse.csc_matrix:

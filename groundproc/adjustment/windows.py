@@ -4,8 +4,8 @@ What is left between them after that is for `joining`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +15,17 @@ from flightlog import frames
 from groundproc.adjustment import lasers
 from groundproc.adjustment.anchors import Attitudes, Positions, Tie
 from groundproc.adjustment.batch import DRAWS, Batch, Posterior, joined, make_unit
+from groundproc.adjustment.control import kept_for, together
 from groundproc.adjustment.factors import H
 from groundproc.adjustment.joining import Stiffness, stiffness_of
 from groundproc.adjustment.motion import ImuTrack, Motion
 from groundproc.adjustment.outside import DELAY, Outside
-from groundproc.adjustment.patches import Patches, all_of, patches_of
+from groundproc.adjustment.patches import Patches, all_of, coarse, patches_of
+from groundproc.adjustment.planes import Clusters
 from groundproc.adjustment.scans import SLICE_NS, STEPS
 from groundproc.adjustment.spline import Path
 from groundproc.adjustment.track import Track
+from groundproc.control import ControlPoint
 
 Array = npt.NDArray[np.float64]
 
@@ -58,6 +61,8 @@ class Sources:
         Positions and poses of another program.
     lasers_apart : bool
         Whether clusters are of one laser each, and the corrections of lasers unknowns.
+    control : tuple of ControlPoint
+        In the local frame.
     """
 
     units: Mapping[str, ImuTrack]
@@ -68,6 +73,7 @@ class Sources:
     exact: tuple[str, ...] = ()
     outside: Sequence[Outside] = ()
     lasers_apart: bool = False
+    control: tuple[ControlPoint, ...] = ()
 
 
 @dataclass(slots=True)
@@ -91,6 +97,8 @@ class Window:
         Of the globals asked for exactly, without what a gyro's axes may differ from its board's.
     corrections : tuple of (ndarray, ndarray), optional
         Of the lasers, shape (64,), and their covariance.
+    control : list of dict
+        What is to be said of each control point; empty where none was met.
     seen : Seen or None
         What the joining needs of it; a window that is the whole flight is not joined, and its sigmas are those of the whole. Those of
         the others are what they do not know of themselves.
@@ -106,6 +114,7 @@ class Window:
     log: list[dict[str, float]]
     covariance: Array | None = None
     corrections: tuple[Array, Array] | None = None
+    control: list[dict[str, Any]] = field(default_factory=list)
     seen: "Seen | None" = None
 
 
@@ -117,10 +126,13 @@ class Seen:
     ----------
     patches : Patches
     stiffness : Stiffness
+    control : Clusters, optional
+        What may be of a surface at some control, in the frame of the coarse path.
     """
 
     patches: Patches
     stiffness: Stiffness
+    control: Clusters | None = None
 
 
 def adjust_window(
@@ -164,13 +176,15 @@ def adjust_window(
         tie=tie,
         outside=sources.outside,
         told=told,
+        control=() if before or more else sources.control,
     )
     posterior = batch.run()
     draws = posterior.draws(DRAWS)
     values, seen = _values(batch, posterior, draws), None
     if before or more:
         stiffness = stiffness_of(batch.path, posterior, draws, RELATIVE)
-        seen = Seen(patches_of(gathered, batch.path, len(before)), stiffness)
+        control = kept_for(sources.control, gathered, batch.path, coarse(batch.path)) if sources.control else None
+        seen = Seen(patches_of(gathered, batch.path, len(before)), stiffness, control)
         # how the whole lies is asked for when all windows are joined
         for name in ("world.turn", "world.shift"):
             draws[:, posterior.unknowns.names[name]] = 0.0
@@ -179,8 +193,9 @@ def adjust_window(
     corrections = None
     if sources.lasers_apart:
         corrections = batch.corrections, lasers.stretched(posterior.covariance(lasers.NAMES), RELATIVE)
+    held = [] if batch.held is None else batch.held.report(batch.clusters, batch.path)
     return Window(
-        first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections, seen
+        first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections, held, seen
     )
 
 
@@ -228,8 +243,8 @@ def _sigmas(
     ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
     for draw in draws:
         part = {name: draw[where] for name, where in unknowns.names.items()}
-        spline = RELATIVE * draw[: unknowns.path_size].reshape(-1, 6)
-        at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
+        spline = draw[: unknowns.path_size].reshape(-1, 6)
+        at = _stretched((spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0, mats, place)
         in_body = at[:, :3] + part.get("ins.turn", np.zeros(3))
         turn = np.einsum("nij,nj->ni", mats, in_body) + part["world.turn"]
         arm = np.cross(at[:, :3], to_ins) + part.get("ins.lever", np.zeros(3))
@@ -246,6 +261,17 @@ def _sigmas(
         uniform_filter1d(s / len(draws), 11, axis=0, mode="nearest") for s in (squares_position, squares_attitude)
     )
     return np.sqrt(position), np.sqrt(attitude + bridge)
+
+
+def _stretched(at: Array, mats: Array, place: Array) -> Array:
+    """Turns in the body and shifts at the knots, shape (n, 6), with what is not of the whole times RELATIVE.
+
+    What moves the whole is shared between the spline and the world's own unknowns, of which only the sum means anything.
+    """
+    turn = np.einsum("nij,nj->ni", mats, at[:, :3]).mean(axis=0)
+    shift = np.cross(turn, place)
+    whole = np.concatenate([turn @ mats, shift + (at[:, 3:] - shift).mean(axis=0)], axis=1)
+    return np.asarray(whole + RELATIVE * (at - whole))
 
 
 def joined_path(windows: Sequence[Window]) -> Path:
@@ -277,6 +303,12 @@ def all_patches(windows: Sequence[Window]) -> Patches:
         slot = window.first + (window.seen.patches.clusters.time_ns - window.path.start_ns) // SLICE_NS
         parts.append(window.seen.patches.of((slot >= begin) & (slot < end)))
     return all_of(parts)
+
+
+def control_clusters(windows: Sequence[Window]) -> Clusters | None:
+    """What all windows kept for control; None where nothing was."""
+    parts = [window.seen.control for window in windows if window.seen is not None and window.seen.control is not None]
+    return together(parts) if parts else None
 
 
 def whole_stiffness(windows: Sequence[Window]) -> Stiffness:

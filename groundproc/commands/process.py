@@ -50,6 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), for methods adjusted and filtered",
     )
+    parser.add_argument(
+        "--control",
+        type=Path,
+        metavar="CSV",
+        help="control points and planes for method adjusted: columns x, y, z, sigma, and more",
+    )
     parser.add_argument("--compass", type=Path, metavar="FILE", help="compass model that method dynamic begins with")
     parser.add_argument(
         "--lasers",
@@ -94,7 +100,7 @@ def _survey(arguments: argparse.Namespace) -> Survey:
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())
     if isinstance(tree["mount"], str):
         tree["mount"] = str(arguments.config.parent / tree["mount"])
-    for name in ("compass", "positions", "lasers"):
+    for name in ("compass", "positions", "control", "lasers"):
         if tree[name] not in (None, ESTIMATE):
             tree[name] = str(arguments.config.parent / tree[name])
     given = {
@@ -110,6 +116,7 @@ def _survey(arguments: argparse.Namespace) -> Survey:
         "compass": arguments.compass and str(arguments.compass),
         "positions": arguments.positions and str(arguments.positions),
         "lasers": arguments.lasers,
+        "control": arguments.control and str(arguments.control),
     }
     return config.from_mapping(tree | {k: v for k, v in given.items() if v is not None}, Survey, "command line")
 
@@ -126,7 +133,23 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         + (f"; {track['note']}" if track["note"] else ""),
         f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
         + (f"; {sync['note']}" if sync["note"] else ""),
+        *_control_lines(quality.get(track["method"], {}).get("control")),
         f"mount from {quality['mount']['source']}",
         f"look at {folder / 'cloud_height.png'} and {folder / 'cloud_intensity.png'}; all figures are in {folder / 'quality.json'}",
     ]
     return "\n".join(lines)
+
+
+def _control_lines(control: dict[str, Any] | None) -> list[str]:
+    """How the cloud meets its control points."""
+    if not control:
+        return []
+    lines = []
+    for use, name in (("used", "control points"), ("check", "check points, not used")):
+        found = control[use]
+        if found["count"]:
+            lines.append(
+                f"{found['count']} {name}: surface off by {found['before_rms_m']:.3f} m rms before, {found['after_rms_m']:.3f} m after "
+                f"(expected {found['sigma_m']:.3f})"
+            )
+    return lines + ([f"control: {control['note']}"] if control["note"] else [])

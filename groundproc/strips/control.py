@@ -1,51 +1,30 @@
-"""Control points: what is known of the surface from elsewhere."""
+"""Control points among the clusters of strips: what is known of the surface from elsewhere."""
 
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError
+from groundproc import control
 from groundproc.strips.clusters import CLUSTER
 from groundproc.strips.rows import CONTROL
 
 Array = npt.NDArray[np.float64]
 
-COLUMNS: Final = ("x", "y", "z", "sigma")
-
 
 def read_control(path: Path) -> Array:
-    """Points on the surface in map coordinates with their sigma [m], shape (n, 4); the first line names the columns x, y, z, sigma.
+    """Places on the surface in map coordinates with their sigma [m], shape (n, 4): those to be used, planes at five places each.
 
     Raises
     ------
     CaptureError
-        It cannot be read, or a line is not four numbers, the last above 0.
+        See `groundproc.control.read_control`; or none of them is to be used.
     """
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
-    names = [word.strip().lower() for word in lines[0].split(",")] if lines else []
-    if not set(COLUMNS) <= set(names):
-        raise CaptureError(f"{path}: the first line has no column {', '.join(n for n in COLUMNS if n not in names)}")
-    places = [names.index(name) for name in COLUMNS]
-    found = []
-    for number, line in enumerate(lines[1:], 2):
-        words = line.split(",")
-        if not line.strip():
-            continue
-        try:
-            row = [float(words[place]) for place in places]
-        except (ValueError, IndexError):
-            row = [np.nan]
-        if not np.isfinite(row).all() or row[3] <= 0:
-            raise CaptureError(f"{path}: line {number}: {line.strip()!r} found, expected x, y, z and a sigma above 0")
-        found.append(row)
-    if not found:
-        raise CaptureError(f"{path}: holds no points")
-    return np.array(found)
+    found = control.table(control.read_control(path))
+    if not len(found):
+        raise CaptureError(f"{path}: holds check points only, expected points that may be used")
+    return found
 
 
 def as_clusters(control: Array, origin_m: Array, time_ns: int) -> npt.NDArray[np.void]:

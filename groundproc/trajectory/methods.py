@@ -45,11 +45,12 @@ def estimate(given: Given, progress: Progress) -> Estimate:
 def candidates(survey: Survey) -> tuple[str, ...]:
     """Methods to try, the best first.
 
-    `best` goes down only as far as the other options allow: only the adjustment is causal, only it and the filter take positions in.
+    `best` goes down only as far as the other options allow: only the adjustment is causal or takes control, only it and the filter take
+    positions.
     """
     if survey.method != "best":
         return (survey.method,)
-    if survey.causal:
+    if survey.causal or survey.control is not None:
         return ("adjusted",)
     return ("adjusted", "filtered") if survey.positions is not None else ("adjusted", "filtered", "ins")
 
@@ -120,7 +121,8 @@ def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
 
 
 OPTIONS_OF: Final = {
-    "positions": ("adjusted", "filtered"), "compass": ("dynamic",), "causal": ("adjusted",), "pose_grid_ms": ("ins",),
+    "positions": ("adjusted", "filtered"),
+    "control": ("adjusted",), "compass": ("dynamic",), "causal": ("adjusted",), "pose_grid_ms": ("ins",),
 }  # fmt: skip
 """Options of the survey that some methods alone look at."""
 

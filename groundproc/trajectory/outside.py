@@ -1,14 +1,19 @@
-"""The positions or poses that the survey names, brought into the flight's local frame."""
+"""The positions, poses and control points that the survey names, brought into the flight's local frame."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from flightlog.clock import utc_text
 from flightlog.errors import LogError
 from groundproc import geodesy
+from groundproc.control import ControlPoint, read_control
 from groundproc.positions.fixes import OutsideFixes, lever_arm, outside_fixes
 from groundproc.positions.reading import read_solution
 from groundproc.positions.solution import ELLIPSOID, MSL, Quality
+from groundproc.trajectory import ins
 from groundproc.trajectory.method import Given
 
 SMOOTHED_INTERVAL_S: Final = 1.0
@@ -51,3 +56,46 @@ def surveyed(given: Given) -> list[OutsideFixes]:
 def _poses_height(height: str) -> str:
     """Poses do not say what their heights refer to; they are taken to be those of the survey."""
     return height if height in (ELLIPSOID, MSL) else ELLIPSOID
+
+
+FARTHEST_M: Final = 1000.0
+"""A control file none of whose points is so near to the flight is in other coordinates."""
+
+
+def surveyed_control(given: Given) -> tuple[ControlPoint, ...]:
+    """The control points and planes that the survey names, in the local frame: read in the output's coordinates and heights.
+
+    Raises
+    ------
+    LogError, CaptureError
+        They cannot be read, or lie nowhere near the flight.
+    """
+    survey, frame = given.survey, given.frame
+    if survey.control is None:
+        return ()
+    points = read_control(Path(survey.control))
+    code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    projection = geodesy.Projection(frame, geodesy.projected_crs(code))
+    places = projection.local(np.array([point.place_m for point in points]))
+    flown = np.concatenate(
+        [frame.from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height_m) for fix in given.fixes]
+    )
+    off = np.abs(places[:, None] - flown[None, :: max(1, len(flown) // 500)]).max(axis=2).min(axis=1)
+    if not np.nanmin(np.where(np.isfinite(off), off, np.inf)) < FARTHEST_M:
+        raise LogError(
+            f"{survey.control}: no point within {FARTHEST_M:.0f} m of the flight, expected coordinates of EPSG:{code} "
+            f"({projection.crs.name}) and heights {ins.HEIGHTS[survey.height]}"
+        )
+    return tuple(
+        replace(point, place_m=place, normal=_local_normal(projection, point, place))
+        for point, place in zip(points, places, strict=True)
+        if np.isfinite(place).all()
+    )
+
+
+def _local_normal(projection: geodesy.Projection, point: ControlPoint, place: np.ndarray) -> np.ndarray | None:
+    """A plane's normal, stated along the map's axes: these are turned by the convergence of meridians."""
+    if point.normal is None:
+        return None
+    ahead = projection.local((point.place_m + point.normal)[None])[0] - place
+    return np.asarray(ahead / np.linalg.norm(ahead))

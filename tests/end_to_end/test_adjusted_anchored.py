@@ -17,6 +17,7 @@ from flightlog import frames
 from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
+from groundproc.cli import main
 from groundproc.flight import read_flight
 from groundproc.survey import Survey
 from groundproc.timeline import legs
@@ -124,7 +125,7 @@ def test_centimetre_positions_make_the_whole_right_to_centimetres(plain: Made, p
     assert positioned.estimate.method == "adjusted"
     assert not positioned.estimate.warning
     # without, the GNSS's metres
-    assert np.linalg.norm(plain.position_m.mean(axis=0)) > 0.5
+    assert np.linalg.norm(plain.position_m.mean(axis=0)) > 0.3
     assert np.sqrt(np.mean(np.square(positioned.position_m).sum(axis=1))) < 0.03
     assert (np.abs(positioned.position_m) < 3.0 * positioned.sigma_m).mean() > 0.95
     assert (np.median(positioned.sigma_m, axis=0) < 0.05).all()
@@ -150,3 +151,129 @@ def test_a_wrong_fix_of_some_seconds_is_not_followed(flight: Any, tmp_path: Path
     found = made(flight.folder, Survey(positions=str(tmp_path / "wrong.pos"), geoid=UNDULATION_M))
     # a fifth of the fixes is 0.52 m off: their mean would be off by 0.1 m
     assert np.sqrt(np.mean(np.square(found.position_m).sum(axis=1))) < 0.05
+
+
+# --- control ---
+
+
+def surveyed(
+    folder: Path, kinds: tuple[str, ...], count: int, rng: np.random.Generator
+) -> list[tuple[str, Array, Array]]:
+    """Places on surfaces that the lidar met, with their normals, as a surveyor would choose them: flat around and apart."""
+    truth = read_truth(folder)
+    hits = np.load(folder / "truth_points.npy", mmap_mode="r")
+    hits = np.array(hits[np.sort(rng.integers(0, len(hits), 150_000))])
+    hits = hits[~hits["mixed"] & (hits["range_m"] < 20.0)]
+    place = np.stack([hits["x"], hits["y"], hits["z"]], axis=1)
+    names = np.array(truth.surfaces)[hits["surface"]]
+    found: list[tuple[str, Array, Array]] = []
+    for i in range(count):
+        kind = kinds[i % len(kinds)]
+        candidates = np.flatnonzero(np.char.startswith(names, kind) & ~np.char.endswith(names, "reveals"))
+        for n in rng.permutation(candidates).tolist():
+            near = np.linalg.norm(place - place[n], axis=1) < 0.5
+            alike = near & (names == names[n]) & (hits["normal"] @ hits["normal"][n] > 0.99)
+            apart = all(np.linalg.norm(place[n] - other) > 3.0 for _, other, _ in found)
+            if apart and alike.sum() >= 12 and alike.sum() > 0.95 * near.sum():
+                found.append((kind, place[n], hits["normal"][n].astype(np.float64)))
+                break
+        else:
+            raise AssertionError(f"no place left on {kind}")
+    return found
+
+
+def write_control(folder: Path, out: Path, rows: list[tuple[str, Array, str]]) -> None:
+    """Name, local place and use of each point, in UTM and heights above sea level, with a sigma of 1 cm."""
+    origin = read_truth(folder).content["local_origin"]
+    height = origin["height_msl_m"] + UNDULATION_M
+    to_local = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +step +proj=topocentric "
+        f"+lat_0={origin['latitude_deg']} +lon_0={origin['longitude_deg']} +h_0={height}"
+    )
+    zone = int((origin["longitude_deg"] + 180.0) // 6.0) + 1
+    utm = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{32600 + zone}", always_xy=True)
+    lines = ["name,x,y,z,sigma,use"]
+    for name, place, use in rows:
+        east, north, height = place
+        longitude, latitude, up = to_local.transform(east, north, height, direction="INVERSE")
+        easting, northing = utm.transform(longitude, latitude)
+        lines.append(f"{name},{easting:.4f},{northing:.4f},{up - UNDULATION_M:.4f},0.01,{use}")
+    out.write_text("\n".join(lines) + "\n")
+
+
+FACES = ("house south", "house west", "grass", "house roof south")
+
+
+@pytest.fixture(scope="module")
+def controlled(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Twelve points with noise of 1 cm, one of them half a metre off its surface, and six to check by."""
+    rng = np.random.default_rng(6)
+    rows = []
+    for i, (kind, place, normal) in enumerate(surveyed(flight.folder, FACES, 18, rng)):
+        noisy = place + 0.01 * rng.standard_normal(3) + (0.5 * normal if i == 1 else 0.0)
+        rows.append((f"{kind} {i}", noisy, "check" if i >= 12 else "control"))
+    path = tmp_path_factory.mktemp("control") / "control.csv"
+    write_control(flight.folder, path, rows)
+    return made(flight.folder, Survey(method="adjusted", control=str(path)))
+
+
+def test_control_points_lay_the_whole_on_the_earth(plain: Made, controlled: Made) -> None:
+    assert np.linalg.norm(plain.position_m.mean(axis=0)) > 0.3
+    assert not controlled.estimate.warning
+    assert np.sqrt(np.mean(np.square(controlled.position_m).sum(axis=1))) < 0.04
+    assert (np.abs(controlled.position_m) < 3.0 * controlled.sigma_m).mean() > 0.9
+    assert np.median(controlled.sigma_m) < 0.05
+    # heading by points 20 m apart to some centimetres, tilt as gravity has it
+    assert np.abs(np.rad2deg(controlled.turn_rad.mean(axis=0))).max() < 0.15
+    assert controlled.relative_m < 1.3 * plain.relative_m + 1e-3
+
+
+def test_a_blundered_point_is_named(controlled: Made) -> None:
+    control = controlled.estimate.report["control"]
+    assert control["rejected"] == ["house west 1"]
+    assert "house west 1 is 0." in control["note"]
+    (blunder,) = [point for point in control["points"] if point["name"] == "house west 1"]
+    assert abs(blunder["after_m"]) == pytest.approx(0.5, abs=0.06)
+
+
+def test_check_points_are_the_figure_for_users(controlled: Made) -> None:
+    control = controlled.estimate.report["control"]
+    assert control["check"]["count"] == 6
+    assert control["check"]["before_rms_m"] > 0.3
+    assert control["check"]["after_rms_m"] < 3.0 * control["check"]["sigma_m"]
+    assert control["used"]["count"] >= 8
+    assert control["used"]["after_rms_m"] < 2.0 * control["used"]["sigma_m"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "code", "said"),
+    [
+        (None, ["--control", "nowhere.csv"], 1, "nowhere.csv: cannot be read"),
+        ("x,y,z,sigma\n1,2,3,0\n", [], 1, "line 2"),
+        (
+            "x,y,z,sigma\n500000,6000000,50,0.01\n",
+            [],
+            1,
+            "no point within 1000 m of the flight, expected coordinates of EPSG:32633",
+        ),
+        ("x,y,z,sigma\n1,2,3,0.01\n", ["--method", "filtered"], 2, "only method adjusted uses it"),
+        ("x,y,z,sigma\n1,2,3,0.01\n", ["--causal"], 2, "known after the flight only"),
+    ],
+)
+def test_control_that_cannot_be_used_is_one_sentence(
+    flight: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: str | None,
+    words: list[str],
+    code: int,
+    said: str,
+) -> None:
+    if text is not None:
+        (tmp_path / "c.csv").write_text(text)
+        words = ["--control", str(tmp_path / "c.csv"), *words]
+    assert main(["process", str(flight.log), "-o", str(tmp_path / "out"), *words]) == code
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
