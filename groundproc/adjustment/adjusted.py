@@ -137,7 +137,7 @@ class Run:
 
     SIGMA_SOURCE: ClassVar = (
         "posterior of the adjustment: draws from it, with the lidar's information divided by 4 because neighbouring returns share "
-        "errors; absolute position and heading are the GNSS's and the compass's"
+        "errors; absolute position and heading are those of control, outside positions, GNSS and compass"
     )
 
     windows: list[Window]

@@ -31,9 +31,9 @@ from groundproc.adjustment.factors import (
     turn_factor,
 )
 from groundproc.adjustment.motion import ImuTrack, on_grid
-from groundproc.adjustment.outside import DELAY, Outside, outside_factors
+from groundproc.adjustment.outside import DELAY, Outside, laid_by_pieces, outside_factors
 from groundproc.adjustment.planes import Clusters, rows_of
-from groundproc.adjustment.scans import STEPS
+from groundproc.adjustment.scans import SLICE_NS, STEPS
 from groundproc.adjustment.solve import Problem, problem
 from groundproc.adjustment.spline import Path
 from groundproc.control import ControlPoint
@@ -50,6 +50,8 @@ DEFLATION: Final = 4.0
 two sigmas (tests)."""
 EXACT: Final = 1e-8
 """Covariances are exact to this share of the prior's variance; of what is known ten thousand times better, in variance, to 1e-4."""
+BLIND: Final = 50
+"""Clusters of a slice below which it saw next to nothing."""
 DRAWS: Final = 12
 """Draws from the posterior that the sigmas are from: right to a fifth."""
 
@@ -122,6 +124,10 @@ class Batch:
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> "Posterior":
         """All Gauss-Newton steps, and the posterior of the last."""
+        if self.outside:
+            slot = (self.clusters.time_ns - self.path.start_ns) // SLICE_NS
+            view = np.bincount(np.clip(slot, 0, self.path.intervals - 1), minlength=self.path.intervals) >= BLIND
+            self.path = laid_by_pieces(self.path, self.outside, view)
         for number, (voxel_m, cut) in enumerate(rounds):
             last = self.step(voxel_m, cut, weigh=number == 1)
         for _ in range(MORE_ROUNDS):

@@ -5,6 +5,7 @@ known (the spectrum of an autoregressive process at frequency zero), and no diff
 shape from one second to the next, which the lidar knows better, is left to it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,7 +16,7 @@ from scipy import sparse
 from flightlog import frames
 from groundproc.adjustment.anchors import means, poses, seconds, spots, within
 from groundproc.adjustment.factors import Factor, RowBuilder, Unknowns, cross, eye
-from groundproc.adjustment.scans import STEP_NS
+from groundproc.adjustment.scans import STEP_NS, STEPS
 from groundproc.adjustment.spline import Path
 from groundproc.positions.fixes import OutsideFixes
 from groundproc.positions.solution import Quality
@@ -99,6 +100,87 @@ def outside_track(fixes: OutsideFixes, mat_ins_lidar: Array, lidar_m: Array, utc
         fixes.attitude_covariance_rad2 if known else None,
         float(np.hypot(utc.sigma_ns * 1e-9, LEAST_DELAY_SIGMA_S if utc.source == "gprmc" else BY_BOOT_SIGMA_S)),
     )
+
+
+LONGEST_BLIND: Final = 10
+"""Slices without a view after which the map may have gone astray."""
+ROUGH_M: Final = 0.3
+"""Positions that are no better do not move pieces."""
+FEWEST_OF_PIECE: Final = 5
+"""Positions by which a piece of the flight can be laid."""
+
+
+def laid_by_pieces(path: Path, given: Sequence[Outside], view: npt.NDArray[np.bool_]) -> Path:
+    """A path whose pieces between long blind stretches lie, each as a whole, where the positions have them.
+
+    After a blind stretch the odometry goes on from where its inertial sensors had drifted to, beside its own map. A metre is too far for
+    the planes of both pieces to meet, and soft enough for a wrong meeting to hold.
+
+    Parameters
+    ----------
+    path : Path
+    given : sequence of Outside
+    view : ndarray of bool, shape (intervals,)
+        Slices with clusters.
+    """
+    pieces = _pieces(view)
+    if len(pieces) < 2 or not given:
+        return path
+    sigma_m = float(np.sqrt(np.median(np.concatenate([each.covariance_m2[:, 0, 0] for each in given]))))
+    if sigma_m > ROUGH_M:
+        return path
+    time_ns = np.concatenate([each.time_ns for each in given])
+    inside = within(time_ns, path)
+    _, _, step, share = spots(time_ns[inside], path)
+    quat, position = poses(path, step, share)
+    lever = np.concatenate([np.tile(each.lever_m, (len(each.time_ns), 1)) for each in given])[inside]
+    stated = np.concatenate([each.position_m for each in given])[inside]
+    point = position + np.einsum("nij,nj->ni", frames.mat_from_quat(quat), lever)
+    grid, turns, moves = [], [], []
+    for first, last in pieces:
+        mine = (step >= first * STEPS) & (step < last * STEPS)
+        if mine.sum() < FEWEST_OF_PIECE:
+            continue
+        turn, about, shift = _level_fit(point[mine], stated[mine], sigma_m)
+        nodes = np.arange(first * STEPS, last * STEPS + 1)
+        off = path.position_m[nodes] - about
+        moves.append(_level(off, turn) - off + shift)
+        grid.append(nodes)
+        turns.append(np.full(len(nodes), turn))
+    if not grid:
+        return path
+    nodes, known = np.arange(len(path.quat)), np.concatenate(grid)
+    move = np.stack([np.interp(nodes, known, axis) for axis in np.concatenate(moves).T], axis=1)
+    about_up = np.zeros((len(nodes), 3))
+    about_up[:, 2] = np.interp(nodes, known, np.concatenate(turns))
+    quat = frames.quat_multiply(frames.quat_exp(about_up), path.quat)
+    return Path(path.start_ns, quat, path.position_m + move, path.step_ns)
+
+
+def _pieces(view: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last slice, the last excluded, of the stretches between long blind ones."""
+    seen = np.flatnonzero(view)
+    if not len(seen):
+        return []
+    breaks = np.flatnonzero(np.diff(seen) > LONGEST_BLIND)
+    return [(int(seen[a]), int(seen[b]) + 1) for a, b in zip([0, *(breaks + 1)], [*breaks, len(seen) - 1], strict=True)]
+
+
+def _level_fit(point: Array, stated: Array, sigma_m: float) -> tuple[float, Array, Array]:
+    """Turn about the vertical [rad], the place that it is about, and shift, that lay points on those stated: tilt is gravity's."""
+    about = point.mean(axis=0)
+    a, b = point - about, stated - stated.mean(axis=0)
+    turn = 0.0
+    # a heading only where the points are far enough apart to have one, to a degree
+    if np.linalg.norm(a[:, :2], axis=1).max() > 60.0 * sigma_m:
+        turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
+    return turn, about, np.asarray(np.median(stated - about - _level(a, turn), axis=0))
+
+
+def _level(off: Array, turn: float) -> Array:
+    """Vectors, shape (n, 3), turned about the vertical."""
+    sine, cosine = np.sin(turn), np.cos(turn)
+    return np.asarray(off @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
 
 
 def outside_factors(

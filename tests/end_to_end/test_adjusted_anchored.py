@@ -17,6 +17,7 @@ from flightlog import frames
 from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
+from groundproc.adjustment import adjusted, windows
 from groundproc.cli import main
 from groundproc.flight import read_flight
 from groundproc.survey import Survey
@@ -243,6 +244,25 @@ def test_check_points_are_the_figure_for_users(controlled: Made) -> None:
     assert control["check"]["after_rms_m"] < 3.0 * control["check"]["sigma_m"]
     assert control["used"]["count"] >= 8
     assert control["used"]["after_rms_m"] < 2.0 * control["used"]["sigma_m"]
+
+
+def test_control_holds_a_flight_of_several_windows(flight: Any, tmp_path: Path) -> None:
+    """Windows of 8 s, joined: the control is the joining's."""
+    rng = np.random.default_rng(8)
+    rows = [
+        (f"{kind} {i}", place + 0.01 * rng.standard_normal(3), "control")
+        for i, (kind, place, _) in enumerate(surveyed(flight.folder, FACES, 16, rng))
+    ]
+    write_control(flight.folder, tmp_path / "control.csv", rows)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adjusted, "WINDOW", 80)
+        for module in (adjusted, windows):
+            patch.setattr(module, "OVERLAP", 30)
+        found = made(flight.folder, Survey(method="adjusted", control=str(tmp_path / "control.csv")))
+    assert len(found.estimate.report["windows"]) > 2
+    assert found.estimate.report["control"]["used"]["count"] > 8
+    assert np.sqrt(np.mean(np.square(found.position_m).sum(axis=1))) < 0.08
+    assert (np.abs(found.position_m) < 3.0 * found.sigma_m).mean() > 0.9
 
 
 @pytest.mark.parametrize(

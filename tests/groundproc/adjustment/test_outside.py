@@ -10,7 +10,7 @@ import pytest
 from flightlog import frames
 from groundproc.adjustment.batch import turned
 from groundproc.adjustment.factors import Factor, Unknowns
-from groundproc.adjustment.outside import DELAY, LEAST_SIGMA_M, Outside, outside_factors
+from groundproc.adjustment.outside import DELAY, LEAST_SIGMA_M, Outside, laid_by_pieces, outside_factors
 from groundproc.adjustment.scans import STEP_NS, STEPS
 from groundproc.adjustment.spline import Path
 
@@ -142,3 +142,28 @@ def test_what_lies_outside_the_path_or_has_no_sigma_of_attitude_is_no_row(path: 
     assert [f.name for f in factors(replace(given, quat=None), path)] == ["outside position"]
     unknown = np.full_like(given.covariance_m2, np.nan)
     assert [f.name for f in factors(replace(given, attitude_covariance_rad2=unknown), path)] == ["outside position"]
+
+
+def test_pieces_between_blind_stretches_are_laid_on_the_positions(path: Path) -> None:
+    """From 2 to 4 s nothing is seen; what comes after is a metre off and turned, with what lies between drifting there."""
+    view = np.ones(INTERVALS, np.bool_)
+    view[20:40] = False
+    share = np.clip((np.arange(len(path.quat)) / STEPS - 20) / 20, 0.0, 1.0)[:, None]
+    turn = np.array([0.0, 0.0, 0.05])
+    strayed = Path(
+        START_NS,
+        frames.quat_multiply(frames.quat_exp(share * turn), path.quat),
+        path.position_m + share * (path.position_m @ (turned(turn) - np.eye(3)).T + [0.6, -0.9, 1.1]),
+    )
+    found = laid_by_pieces(strayed, [outside()], view)
+    off = np.linalg.norm(found.position_m - path.position_m, axis=1)
+    seen = np.repeat(view, STEPS)
+    # 8 m of path tell a heading to what the noise of nothing leaves; medians of a curved path are no mean
+    assert off[:-1][seen].max() < 0.02
+    # between, where the place itself goes 8 m on while the turn grows by 0.05 rad: a quarter of the product, bent
+    assert off.max() < 0.25 * 8.0 * 0.05 * 1.2
+    assert np.abs(np.diff(off)).max() < 0.01
+    wrong = frames.quat_log(frames.quat_multiply(found.quat, frames.quat_inverse(path.quat)))
+    assert np.abs(wrong[:-1][seen]).max() < 0.01
+    assert laid_by_pieces(strayed, [outside()], np.ones(INTERVALS, np.bool_)) is strayed
+    assert laid_by_pieces(strayed, [], view) is strayed
