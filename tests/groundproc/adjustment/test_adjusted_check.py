@@ -11,9 +11,9 @@ from groundproc.adjustment.adjusted import SLID_SIGMAS, Run
 def run_with(restarts: int, slid: float, outside: tuple[str, ...]) -> Run:
     track: Any = SimpleNamespace(restarts=restarts, matched=[500] * 100)
     log = [{"chi_square": 0.2, "moved_m": 0.001, "position_drift": slid, "position_rms": 0.3}]
-    windows: Any = [SimpleNamespace(log=log)]
+    windows: Any = [SimpleNamespace(log=log, control=[])]
     unused: Any = None
-    sources: Any = SimpleNamespace(outside=outside)
+    sources: Any = SimpleNamespace(outside=outside, control=())
     return Run(windows, unused, track, unused, sources)
 
 
