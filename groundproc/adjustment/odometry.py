@@ -15,7 +15,7 @@ from numba import njit
 
 from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.adjustment.motion import Motion
-from groundproc.adjustment.rotations import mat_of_quat, quat_difference, quat_turned
+from groundproc.adjustment.rotations import mat_of_quat, quat_difference, quat_turned, unit_vector
 from groundproc.adjustment.scans import CLUSTER_DTYPE, STEP_NS, STEPS, Clusterer, Slice, voxel_key
 from groundproc.adjustment.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, TILT, PlaneMap, find
 
@@ -33,6 +33,8 @@ INFLATION: Final = 4.0
 """Neighbouring clusters share their errors: so much is taken off their information."""
 GROUND: Final = 0.966
 """Cosine of the steepest slope of what counts as ground: 15 deg."""
+GROUND_MEMORY: Final = 0.99
+"""What is kept of the sum of the ground's normals from slice to slice: the mean normal is that of some ten seconds."""
 FLAT: Final = 1e-3
 """Share of the information below which a direction counts as not observed."""
 ROUNDS: Final = 4
@@ -118,6 +120,7 @@ class Odometry:
         self._motion = motion
         self.map = PlaneMap(voxel_m)
         self._cluster = Clusterer(voxel_m)
+        self._ground = np.zeros(3)
         density = 2.0 * max(motion.rate_density, 1e-6), 3.0 * max(motion.force_density, 1e-4)
         step = STEP_S
         self._noise = np.concatenate(
@@ -171,6 +174,7 @@ class Odometry:
             matched, residual, s.covariance = _update(
                 self.map.table, self.map.keys, self.map.voxels, self.voxel_m, body, clusters["count"], s.quat,
                 s.position_m, s.velocity_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, s.gravity_m_s2, s.covariance,
+                self._ground,
             )  # fmt: skip
             mat_of_quat(s.quat, mat)
             world = body @ mat.T + s.position_m
@@ -322,72 +326,103 @@ def _add(row: Any, weight: float, residual: float, information: Any, pull: Any) 
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(
+def _matches(
     table: Any, keys: Any, voxels: Any, per_m: float, body: Any, counts: Any, mat: Any, position: Any, gate: float,
-    added: Any, pull: Any, level_added: Any, level_pull: Any,
-) -> Any:  # fmt: skip
-    """Information and pull of all clusters that find a plane; and the same with the vertical for the normals of all ground."""
-    j = np.empty(6)
-    matched, squares = 0, 0.0
-    added[:, :], level_added[:, :] = 0.0, 0.0
-    pull[:], level_pull[:] = 0.0, 0.0
+    row: Any, residual: Any, weight: Any, ground: Any,
+) -> int:  # fmt: skip
+    """Voxel of each cluster, -1 where it finds no plane, with distance and weight; the normals of ground, up, are added to `ground`."""
+    matched = 0
     for n in range(len(body)):
         bx, by, bz = body[n, 0], body[n, 1], body[n, 2]
         x = mat[0, 0] * bx + mat[0, 1] * by + mat[0, 2] * bz + position[0]
         y = mat[1, 0] * bx + mat[1, 1] * by + mat[1, 2] * bz + position[1]
         z = mat[2, 0] * bx + mat[2, 1] * by + mat[2, 2] * bz + position[2]
-        row = find(table, keys, voxel_key(x, y, z, per_m))
-        if row < 0 or voxels[row, FLATNESS] < 0.0:
+        row[n] = find(table, keys, voxel_key(x, y, z, per_m))
+        if row[n] < 0:
             continue
-        v = voxels[row]
-        nx, ny, nz = v[NORMAL], v[NORMAL + 1], v[NORMAL + 2]
-        e = nx * x + ny * y + nz * z - v[LEVEL]
-        if abs(e) > gate:
+        v = voxels[row[n]]
+        e = v[NORMAL] * x + v[NORMAL + 1] * y + v[NORMAL + 2] * z - v[LEVEL]
+        if v[FLATNESS] < 0.0 or abs(e) > gate:
+            row[n] = -1
             continue
         # a plane known from a few lines is uncertain away from them
         off = (x - v[MEAN]) ** 2 + (y - v[MEAN + 1]) ** 2 + (z - v[MEAN + 2]) ** 2
         variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * v[FLATNESS] + v[TILT] * off
-        weight = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
+        weight[n] = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
+        residual[n] = e
         matched += 1
+        if abs(v[NORMAL + 2]) > GROUND:
+            signed = weight[n] if v[NORMAL + 2] > 0.0 else -weight[n]
+            for c in range(3):
+                ground[c] += signed * v[NORMAL + c]
+    return matched
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(
+    voxels: Any, body: Any, mat: Any, row: Any, residual: Any, weight: Any, ground: Any, added: Any, pull: Any,
+    level_added: Any, level_pull: Any,
+) -> float:  # fmt: skip
+    """Information and pull of all matches, and the same with the mean normal for all ground; gives the sum of squares."""
+    j = np.empty(6)
+    squares = 0.0
+    added[:, :], level_added[:, :] = 0.0, 0.0
+    pull[:], level_pull[:] = 0.0, 0.0
+    for n in range(len(body)):
+        if row[n] < 0:
+            continue
+        v, e = voxels[row[n]], residual[n]
         squares += e * e
-        _row(mat, body[n], nx, ny, nz, j)
-        _add(j, weight, e, added, pull)
-        if abs(nz) > GROUND:
-            _row(mat, body[n], 0.0, 0.0, 1.0 if nz > 0.0 else -1.0, j)
-        _add(j, weight, e, level_added, level_pull)
+        _row(mat, body[n], v[NORMAL], v[NORMAL + 1], v[NORMAL + 2], j)
+        _add(j, weight[n], e, added, pull)
+        if abs(v[NORMAL + 2]) > GROUND:
+            side = 1.0 if v[NORMAL + 2] > 0.0 else -1.0
+            _row(mat, body[n], side * ground[0], side * ground[1], side * ground[2], j)
+        _add(j, weight[n], e, level_added, level_pull)
     for a in range(6):
         for b in range(a):
             added[b, a], level_added[b, a] = added[a, b], level_added[a, b]
-    return matched, squares
+    return squares
 
 
 @njit(cache=True, nogil=True)
 def _update(
     table: Any, keys: Any, voxels: Any, voxel_m: float, body: Any, counts: Any, quat: Any, position: Any, velocity: Any,
-    gyro_bias: Any, accel_bias: Any, gravity: Any, covariance: Any,
+    gyro_bias: Any, accel_bias: Any, gravity: Any, covariance: Any, ground: Any,
 ) -> Any:  # fmt: skip
     to_pose, mine = np.ascontiguousarray(covariance[:, :6]), np.ascontiguousarray(covariance[:6, :6])
     total = np.zeros(STATES)  # correction so far: the prior pulls back to where it began
     mat, turn = np.empty((3, 3)), np.empty(3)
     before = quat.copy()
     added, pull, level_added, level_pull = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    factor, inner = np.zeros((6, 6)), np.eye(6)
+    row, residual, weight = np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body))
+    normals, up = ground.copy(), ground.copy()
     matched, squares = 0, 0.0
     for attempt in range(ROUNDS):
         mat_of_quat(quat, mat)
         gate = 0.5 if attempt == 0 else 0.25
-        matched, squares = _accumulate(
-            table, keys, voxels, 1.0 / voxel_m, body, counts, mat, position, gate, added, pull, level_added, level_pull
+        ground[:] = GROUND_MEMORY * normals
+        matched = _matches(
+            table, keys, voxels, 1.0 / voxel_m, body, counts, mat, position, gate, row, residual, weight, ground
         )
+        up[:] = ground
+        unit_vector(up)
+        squares = _accumulate(voxels, body, mat, row, residual, weight, up, added, pull, level_added, level_pull)
         if matched:
             # normals of flat ground have errors, and thousands of them would seem to hold a place along it: whether anything does is
-            # judged with the vertical for all of them, and where nothing does, that is also what counts
+            # judged with their mean for all of them, and where nothing does, that is also what counts. Not the vertical: the map
+            # leans by what the start's tilt was off, and a turn about any other axis than the ground's own normal tilts it
             known = observable(level_added)
             if np.trace(known) < 5.5:
                 pull = np.ascontiguousarray(known.T) @ level_pull
                 added = np.ascontiguousarray(known.T) @ level_added @ np.ascontiguousarray(known)
-        # (P^-1 + A)^-1 by Woodbury's formula: P itself may be too nearly singular to invert
-        reach = np.linalg.solve(np.eye(6) + added @ mine, added @ total[:6] - pull)
-        change = to_pose @ reach - total
+        # (P^-1 + A)^-1 by Woodbury's formula: P itself may be too nearly singular to invert. With A = L L^T it stays a covariance
+        values, vectors = np.linalg.eigh(added)
+        root = np.sqrt(np.maximum(values, 1e-13 * values[5] + 1e-12))
+        factor = vectors * root
+        inner = np.linalg.inv(np.eye(6) + factor.T @ mine @ factor)
+        change = to_pose @ (factor @ (inner @ (factor.T @ total[:6] - (vectors.T @ pull) / root))) - total
         total += change
         _apply(change, quat, position, velocity, gyro_bias, accel_bias, gravity)
         # the attitude's correction as one rotation from the prediction
@@ -396,5 +431,6 @@ def _update(
         moved = np.abs(change[:6])
         if moved[0] + moved[1] + moved[2] < 1e-5 and moved[3] + moved[4] + moved[5] < 3e-4:
             break
-    left = covariance - to_pose @ np.linalg.solve(np.eye(6) + added @ mine, added @ np.ascontiguousarray(to_pose.T))
+    gain = np.ascontiguousarray(to_pose @ factor)
+    left = covariance - gain @ np.ascontiguousarray(inner @ gain.T)
     return matched, np.sqrt(squares / max(matched, 1)), 0.5 * (left + left.T)

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
+from scipy.ndimage import uniform_filter1d
 
 from groundproc.adjustment.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
 from groundproc.adjustment.odometry import GROUND, observable
@@ -31,6 +32,8 @@ HUBER: Final = 2.0
 """Sigmas beyond which a residual loses weight."""
 CUT: Final = 5.0
 """Sigmas beyond which a cluster is none of this plane: moving things, mixed echoes."""
+GROUND_SLICES: Final = 201
+"""Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
 PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
 
@@ -258,18 +261,68 @@ def assign(world_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.int32], int]:
 def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDArray[np.float32]) -> None:
     """Take out of the rows of each interval the directions that its planes do not show, as the odometry does.
 
-    `rotation` (local from sensor) and `xyz` are those of the rows' clusters.
+    Judged and taken out on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it,
+    and each change of tilt would seem to tell a little of the heading. `rotation` (local from sensor) and `xyz` are those of the rows'
+    clusters.
     """
-    level = rows.jacobian.copy()
-    ground = np.flatnonzero(np.abs(level[:, 5]) > GROUND)
-    side = np.sign(level[ground, 5])
-    level[ground, :3] = np.cross(xyz[ground], rotation[ground, 6:9] * side[:, None])
-    level[ground, 3:] = np.stack([0.0 * side, 0.0 * side, side], axis=1)
+    normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
+    _sum_ground(rows.knot, rows.jacobian, rows.weight, normals)
+    normals = uniform_filter1d(normals, GROUND_SLICES, axis=0, mode="constant")
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    _level(rows.knot, rows.jacobian, rotation, xyz, normals, level)
     blocks = np.zeros((rows.intervals, 6, 6))
     _blocks(rows.knot, level, rows.weight, blocks)
     known = np.array([observable(block) if block[3:, 3:].any() else np.eye(6) for block in blocks])
-    affected = (np.trace(known, axis1=1, axis2=2) < 5.5)[rows.knot]
-    rows.jacobian[affected] = np.einsum("ni,nij->nj", level[affected], known[rows.knot[affected]])
+    affected = np.trace(known, axis1=1, axis2=2) < 5.5
+    _project(rows.knot, affected, known, level, rotation, rows.jacobian)
+
+
+@njit(cache=True, nogil=True)
+def _sum_ground(knot: Any, jacobian: Any, weight: Any, normals: Any) -> None:
+    """Weighted sum of the ground's normals in each interval, up."""
+    for i in range(len(knot)):
+        if abs(jacobian[i, 5]) > GROUND:
+            signed = weight[i] if jacobian[i, 5] > 0.0 else -weight[i]
+            for c in range(3):
+                normals[knot[i], c] += signed * jacobian[i, 3 + c]
+
+
+@njit(cache=True, nogil=True)
+def _level(knot: Any, jacobian: Any, rotation: Any, xyz: Any, normals: Any, out: Any) -> None:
+    """Rows by rotation about the map's axes and by position, those of ground with the ground's mean normal."""
+    for i in range(len(jacobian)):
+        m, j = rotation[i], jacobian[i]
+        if abs(j[5]) > GROUND:
+            side = 1.0 if j[5] > 0.0 else -1.0
+            n = normals[knot[i]]
+            nx, ny, nz = side * n[0], side * n[1], side * n[2]
+            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
+            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
+            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
+            out[i, 0], out[i, 1], out[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+            out[i, 3], out[i, 4], out[i, 5] = nx, ny, nz
+        else:
+            for r in range(3):
+                out[i, r] = m[3 * r] * j[0] + m[3 * r + 1] * j[1] + m[3 * r + 2] * j[2]
+                out[i, 3 + r] = j[3 + r]
+
+
+@njit(cache=True, nogil=True)
+def _project(knot: Any, affected: Any, known: Any, level: Any, rotation: Any, jacobian: Any) -> None:
+    """Rows of the affected intervals anew: what is known of them, by rotation in the body again."""
+    row = np.empty(6)
+    for i in range(len(knot)):
+        k = knot[i]
+        if not affected[k]:
+            continue
+        row[:] = 0.0
+        for a in range(6):
+            for b in range(6):
+                row[b] += level[i, a] * known[k, a, b]
+        m = rotation[i]
+        for c in range(3):
+            jacobian[i, c] = m[c] * row[0] + m[3 + c] * row[1] + m[6 + c] * row[2]
+            jacobian[i, 3 + c] = row[3 + c]
 
 
 @njit(cache=True, nogil=True)

@@ -93,3 +93,12 @@ def flattest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, n
         s = 1.0 / np.sqrt(s)
         normal[0], normal[1], normal[2] = x * s, y * s, z * s
     return smallest, middle
+
+
+@njit(cache=True, nogil=True, inline="always")
+def unit_vector(v: Any) -> None:
+    """Scale a vector of three to length one, in place; nothing stays nothing."""
+    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    if length > 0.0:
+        for i in range(3):
+            v[i] /= length
