@@ -420,8 +420,8 @@ def _update(
         # (P^-1 + A)^-1 by Woodbury's formula: P itself may be too nearly singular to invert. With A = L L^T it stays a covariance
         values, vectors = np.linalg.eigh(added)
         root = np.sqrt(np.maximum(values, 1e-13 * values[5] + 1e-12))
-        factor = vectors * root
-        inner = np.linalg.inv(np.eye(6) + factor.T @ mine @ factor)
+        factor[:, :] = vectors * root
+        inner[:, :] = np.linalg.inv(np.eye(6) + factor.T @ mine @ factor)
         change = to_pose @ (factor @ (inner @ (factor.T @ total[:6] - (vectors.T @ pull) / root))) - total
         total += change
         _apply(change, quat, position, velocity, gyro_bias, accel_bias, gravity)
@@ -431,6 +431,6 @@ def _update(
         moved = np.abs(change[:6])
         if moved[0] + moved[1] + moved[2] < 1e-5 and moved[3] + moved[4] + moved[5] < 3e-4:
             break
-    gain = np.ascontiguousarray(to_pose @ factor)
-    left = covariance - gain @ np.ascontiguousarray(inner @ gain.T)
+    gain = to_pose @ factor
+    left = covariance - gain @ (inner @ gain.T)
     return matched, np.sqrt(squares / max(matched, 1)), 0.5 * (left + left.T)

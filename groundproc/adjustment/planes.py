@@ -274,7 +274,7 @@ def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDA
     _blocks(rows.knot, level, rows.weight, blocks)
     known = np.array([observable(block) if block[3:, 3:].any() else np.eye(6) for block in blocks])
     affected = np.trace(known, axis1=1, axis2=2) < 5.5
-    _project(rows.knot, affected, known, level, rotation, rows.jacobian)
+    _keep_known(rows.knot, affected, known, level, rotation, rows.jacobian)
 
 
 @njit(cache=True, nogil=True)
@@ -308,7 +308,7 @@ def _level(knot: Any, jacobian: Any, rotation: Any, xyz: Any, normals: Any, out:
 
 
 @njit(cache=True, nogil=True)
-def _project(knot: Any, affected: Any, known: Any, level: Any, rotation: Any, jacobian: Any) -> None:
+def _keep_known(knot: Any, affected: Any, known: Any, level: Any, rotation: Any, jacobian: Any) -> None:
     """Rows of the affected intervals anew: what is known of them, by rotation in the body again."""
     row = np.empty(6)
     for i in range(len(knot)):
