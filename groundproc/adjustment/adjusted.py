@@ -498,7 +498,6 @@ def adjust_run(
             pace.caught_up()
             begin = last - OVERLAP
             windows[-1].own = begin - windows[-1].first
-            tracker.track.forget(begin)
     track = tracked(tracker)
     _redo(tracker, motion, early)
     if not windows or len(track) - begin > OVERLAP:

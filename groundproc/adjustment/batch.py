@@ -129,11 +129,14 @@ class Batch:
             view = np.bincount(np.clip(slot, 0, self.path.intervals - 1), minlength=self.path.intervals) >= BLIND
             self.path = laid_by_pieces(self.path, self.outside, view)
         for number, (voxel_m, cut) in enumerate(rounds):
+            last = None  # rows are large: those of the step before go before new ones are made
             last = self.step(voxel_m, cut, weigh=number == 1)
         for _ in range(MORE_ROUNDS):
             if self.log[-1]["moved_m"] < SETTLED_M:
                 break
+            last = None
             last = self.step(*rounds[-1], weigh=False)
+        assert last is not None
         return self.hold(last, *rounds[-1]) if self.control and self.tie is None else last
 
     def hold(self, last: "Posterior", voxel_m: float, cut: bool) -> "Posterior":

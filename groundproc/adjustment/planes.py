@@ -232,11 +232,13 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
         voxel_m, cut, jacobian, plane, weight, residual, inverse,
     )  # fmt: skip
     rows = Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
-    _drop_unobserved(rows, rotation[kept], clusters.xyz_m[kept])
+    rotation, xyz = rotation[kept], clusters.xyz_m[kept]
+    del world, knot, weights, voxel, order, good, keep  # a hundred bytes a cluster
+    _drop_unobserved(rows, rotation, xyz)
     if clusters.laser is not None:
         normal = np.repeat(normals[ids], np.diff(starts), axis=0)
-        in_sensor = np.einsum("nji,nj->ni", rotation[kept].reshape(-1, 3, 3), normal)
-        rows.with_lasers(clusters.laser[kept], clusters.xyz_m[kept], in_sensor)
+        in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), normal)
+        rows.with_lasers(clusters.laser[kept], xyz, in_sensor)
     return rows
 
 

@@ -164,6 +164,7 @@ def adjust_window(
         for name, unit in sources.units.items()
     ]
     gathered = track.gathered(first, last, sources.lasers_apart)
+    track.forget(last - OVERLAP if more else last)
     batch = Batch(
         path,
         gathered,
