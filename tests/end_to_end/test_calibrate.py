@@ -14,6 +14,7 @@ from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.calibration.compass import BINS, read_compass
+from groundproc.calibration.dynamic import with_compass
 from groundproc.calibration.lasers import ESTIMATE, read_lasers
 from groundproc.cli import main
 from groundproc.flight import read_flight
@@ -42,17 +43,21 @@ def made(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def adjusted(folder: Path, lasers: str | None) -> tuple[Estimate, Any]:
+def made_with(folder: Path, survey: Survey, compass: Path | None = None) -> tuple[Estimate, Any]:
+    """An estimate, its headings corrected by a curve where one is given; judged with its cloud where it is adjusted."""
     truth = read_truth(folder)
     with LogReader(truth.log) as reader:
         read = read_flight([reader], "ins")
         timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
-        survey = Survey(method="adjusted", lasers=lasers)
         estimate = methods.estimate(
             gather([reader], read, timeline, truth.nominal_mount, survey), lambda stage, size: None
         )
-        placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
-        return estimate, judge([reader], truth, placed, estimate.mount, estimate.lasers).figures
+        trajectory = (
+            estimate.trajectory if compass is None else with_compass(estimate.trajectory, read_compass(compass))
+        )
+        placed = on_lidar_clock(trajectory, timeline[0].lidar_line, truth)
+        cloud = [reader] if survey.method == "adjusted" else []
+        return estimate, judge(cloud, truth, placed, estimate.mount, estimate.lasers).figures
 
 
 def test_offsets_of_the_lasers_are_found_within_their_sigma(made: Path, flight: Any) -> None:
@@ -75,9 +80,9 @@ def test_offsets_of_the_lasers_are_found_within_their_sigma(made: Path, flight: 
 
 
 def test_a_later_run_with_the_file_has_the_sharper_cloud(made: Path, flight: Any) -> None:
-    without, before = adjusted(flight.folder, None)
-    given, after = adjusted(flight.folder, str(made / "lasers.yaml"))
-    estimated, itself = adjusted(flight.folder, ESTIMATE)
+    without, before = made_with(flight.folder, Survey(method="adjusted"))
+    given, after = made_with(flight.folder, Survey(method="adjusted", lasers=str(made / "lasers.yaml")))
+    estimated, itself = made_with(flight.folder, Survey(method="adjusted", lasers=ESTIMATE))
     assert (without.lasers.range_offset_m == 0.0).all()
     np.testing.assert_allclose(given.lasers.range_offset_m, estimated.lasers.range_offset_m, atol=1e-3)
     assert estimated.report["lasers"]["range_held"] == [False] * LASERS
@@ -107,3 +112,23 @@ def test_the_compass_curve_holds_where_it_was_flown_and_says_where_it_was_not(ma
     assert np.abs(off / sigma).max() < 4.0
     assert np.rad2deg(sigma[~flown]).max() > 1.5 * np.rad2deg(sigma[flown]).min()
     assert "of all headings flown" in (made / "compass.yaml").read_text().splitlines()[1]
+
+
+def test_headings_of_the_autopilot_are_mended_by_the_file(made: Path, flight: Any) -> None:
+    """Its compass is off by 8 deg and more, over part of the circle; what an AHRS sways by on its own, 1 deg, stays."""
+    _, before = made_with(flight.folder, Survey(method="ins"))
+    _, after = made_with(flight.folder, Survey(method="ins"), made / "compass.yaml")
+    assert after["absolute_heading_rms_deg"] < 0.5 * before["absolute_heading_rms_deg"]
+
+
+def test_an_estimate_is_asked_of_the_adjustment_only(
+    flight: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ["process", str(flight.log), "--lasers", "estimate", "-o", str(tmp_path / "out")]
+    for more in (["--method", "filtered"], ["--causal"]):
+        assert main([*words, *more]) == 2
+        assert "only method adjusted finds them" in capfd.readouterr().err
+    lost = ["process", str(flight.log), "--lasers", str(tmp_path / "none.yaml"), "-o", str(tmp_path / "out")]
+    assert main(lost) != 0
+    assert "none.yaml: cannot be read" in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()
