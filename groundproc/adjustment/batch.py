@@ -48,6 +48,8 @@ SETTLED_M: Final = 0.003
 DEFLATION: Final = 4.0
 """The lidar's information is divided by this: errors of neighbouring clusters are not independent. Checked by the share of errors within
 two sigmas (tests)."""
+WHOLE: Final = 1e-6
+"""What the variance of the whole may lack [m^2, deg^2]."""
 EXACT: Final = 1e-8
 """Covariances are exact to this share of the prior's variance; of what is known ten thousand times better, in variance, to 1e-4."""
 BLIND: Final = 50
@@ -141,7 +143,7 @@ class Batch:
 
     def hold(self, last: "Posterior", voxel_m: float, cut: bool) -> "Posterior":
         """Lay a map that is right in itself on the control as a whole, and adjust it with that."""
-        covariance = last.covariance(("world.turn", "world.shift"))
+        covariance = whole_covariance(last, self.path)
         self.held = held_to(self.control, self.clusters, self.path, covariance, DEFLATION)
         if self.held is None:
             return last
@@ -317,6 +319,31 @@ class Posterior:
             right[place] = 1.0 / prior[i]
             columns[i] = self.problem.solve(right, EXACT)[0][places] * prior[i]
         return np.asarray(0.5 * (columns + columns.T))
+
+
+def whole_covariance(posterior: Posterior, path: Path) -> Array:
+    """Covariance of the turn about the origin and the shift of a path as a whole, shape (6, 6).
+
+    The world's unknowns share these with the spline, of whose coefficients the mean is taken: only the sum means anything.
+    """
+    unknowns = posterior.unknowns
+    count = path.intervals + 3
+    knots = np.clip(np.arange(-1, count - 1) * STEPS, 0, len(path.quat) - 1)
+    asked = np.zeros((unknowns.size, 6))
+    spline = asked[: unknowns.path_size].reshape(count, 6, 6)
+    spline[:, :3, :3] = np.swapaxes(frames.mat_from_quat(path.quat[knots]), 1, 2) / count
+    spline[:, 3:, 3:] = np.eye(3) / count
+    x, y, z = path.position_m[knots].mean(axis=0)
+    # the shift about the origin: what the middle moves by less what the turn moves it by
+    spline[:, :3, 3:] = spline[:, :3, :3] @ -np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]).T
+    asked[unknowns.names["world.turn"], :3] = np.eye(3)
+    asked[unknowns.names["world.shift"], 3:] = np.eye(3)
+    # in degrees and metres, so that what a solution may leave out is little of each
+    scale = np.array([np.deg2rad(1.0)] * 3 + [1.0] * 3)
+    found = np.empty((6, 6))
+    for i in range(6):
+        found[i] = asked.T @ posterior.problem.solve(asked[:, i] / scale[i], WHOLE)[0] * scale[i]
+    return np.asarray(0.5 * (found + found.T))
 
 
 def joined(values: Sequence[Array], covariances: Sequence[Array], prior_sigma: Array) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from groundproc.adjustment.anchors import Attitudes, Positions, attitude_factor, fixes_name, position_factors
-from groundproc.adjustment.batch import COMPASS_PRIOR, DEFLATION, DRAWS, Posterior, turned
+from groundproc.adjustment.batch import COMPASS_PRIOR, DEFLATION, DRAWS, Posterior, turned, whole_covariance
 from groundproc.adjustment.control import Held, held_to
 from groundproc.adjustment.factors import Factor, H, RowBuilder, Unknowns, cross, eye, prior_factor, whitened
 from groundproc.adjustment.outside import Outside, outside_factors
@@ -159,7 +159,7 @@ class Joining:
     def _hold(self, last: Posterior) -> Posterior:
         """Lay the flight, which is right in itself, on the control as a whole, and adjust it with that."""
         assert self.control_clusters is not None
-        covariance = last.covariance(("world.turn", "world.shift"))
+        covariance = whole_covariance(last, self.path)
         self.held = held_to(self.control, self.control_clusters, self.path, covariance, DEFLATION)
         if self.held is None:
             return last

@@ -10,7 +10,7 @@ import pytest
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.adjustment.batch import turned
+from groundproc.adjustment.batch import Posterior, turned, whole_covariance
 from groundproc.adjustment.control import GATE_M, Held, control_report, control_warnings, held_to, spots_of
 from groundproc.adjustment.datum import Datum, Placing, find_datum
 from groundproc.adjustment.factors import Unknowns
@@ -309,3 +309,30 @@ def test_a_placing_undone_is_where_one_was() -> None:
     mat, shift = placing.as_turn()
     np.testing.assert_allclose(placing.back(points @ mat.T + shift), points, atol=1e-9)
     assert isinstance(Datum(placing, [], np.zeros(0, bool), np.zeros(0), np.zeros(0), np.zeros(0, bool)), Datum)
+
+
+@pytest.mark.parametrize("by_spline", [False, True])
+def test_the_whole_is_what_world_and_spline_make_together(path: Path, by_spline: bool) -> None:
+    """A turn and shift of known covariance, once in the world's unknowns and once in the spline's coefficients."""
+    unknowns = Unknowns(INTERVALS)
+    unknowns.add("world.turn", np.ones(3))
+    unknowns.add("world.shift", np.ones(3))
+    root = np.random.default_rng(3).standard_normal((6, 6))
+    wanted = root @ root.T
+    motion = np.zeros((unknowns.size, 6))
+    if by_spline:
+        knots = np.clip(np.arange(-1, INTERVALS + 2) * STEPS, 0, len(path.quat) - 1)
+        part = motion[: unknowns.path_size].reshape(-1, 6, 6)
+        part[:, :3, :3] = np.swapaxes(frames.mat_from_quat(path.quat[knots]), 1, 2)
+        part[:, 3:, :3] = np.cross(np.eye(3), path.position_m[knots][:, None]).swapaxes(1, 2)
+        part[:, 3:, 3:] = np.eye(3)
+    else:
+        motion[unknowns.path_size :] = np.eye(6)
+
+    class Known:
+        def solve(self, right: Array, enough: float) -> tuple[Array, int]:
+            assert enough < 1e-4
+            return motion @ (wanted @ (motion.T @ right)), 1
+
+    known: Any = Known()
+    np.testing.assert_allclose(whole_covariance(Posterior(known, unknowns, []), path), wanted, rtol=1e-9, atol=1e-9)
