@@ -34,6 +34,8 @@ CUT: Final = 5.0
 """Sigmas beyond which a cluster is none of this plane: moving things, mixed echoes."""
 GROUND_SLICES: Final = 201
 """Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
+SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
+"""What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
 PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
 
@@ -234,7 +236,7 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     rows = Rows(starts, knot[kept], weights[kept], jacobian, plane, weight, residual, inverse, kept, path.intervals)
     rotation, xyz = rotation[kept], clusters.xyz_m[kept]
     del world, knot, weights, voxel, order, good, keep  # a hundred bytes a cluster
-    _drop_unobserved(rows, rotation, xyz)
+    _drop_unobserved(rows, rotation, xyz, voxel_m)
     if clusters.laser is not None:
         normal = np.repeat(normals[ids], np.diff(starts), axis=0)
         in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), normal)
@@ -260,11 +262,15 @@ def assign(world_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.int32], int]:
     return voxel, int(voxels)
 
 
-def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDArray[np.float32]) -> None:
+def _drop_unobserved(
+    rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDArray[np.float32], voxel_m: float
+) -> None:
     """Take out of the rows of each interval the directions that its planes do not show, as the odometry does.
 
     Judged and taken out on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it,
-    and each change of tilt would seem to tell a little of the heading. `rotation` (local from sensor) and `xyz` are those of the rows'
+    and each change of tilt would seem to tell a little of the heading. Where the heading is not seen at all, tilts count no more than
+    the shape of the path between two knots is known: a gyro's offset about the vertical shows in them by the small part that a body
+    leans, and what is far below that noise would settle it wrongly. `rotation` (local from sensor) and `xyz` are those of the rows'
     clusters.
     """
     normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
@@ -277,6 +283,12 @@ def _drop_unobserved(rows: Rows, rotation: npt.NDArray[np.float32], xyz: npt.NDA
     known = np.array([observable(block) if block[3:, 3:].any() else np.eye(6) for block in blocks])
     affected = np.trace(known, axis1=1, axis2=2) < 5.5
     _keep_known(rows.knot, affected, known, level, rotation, rows.jacobian)
+    blind = affected & (known[:, 2, 2] < 0.5)
+    if blind.any():
+        share = np.ones(rows.intervals)
+        share[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(blocks[blind, :3, :3])[:, 2])
+        rows.weight *= share[rows.knot]
+        _replane(rows.first, rows.plane, rows.weight, rows.residual_m, voxel_m, rows.inverse)
 
 
 @njit(cache=True, nogil=True)
@@ -561,6 +573,13 @@ def _weigh(
                 expected += variance[i]
                 count += 1
             rough = max((4.0 * ROUGHNESS_M**2 + squares - expected) / (max(count - 3, 0) + 4.0), 0.25 * ROUGHNESS_M**2)
+
+
+@njit(cache=True, nogil=True)
+def _replane(first: Any, plane: Any, weight: Any, residual: Any, voxel_m: float, inverse: Any) -> None:
+    """Inverse of each plane's normal matrix for weights that have changed."""
+    for v in range(len(first) - 1):
+        _plane(first[v], first[v + 1], plane, weight, residual, voxel_m, inverse[v])
 
 
 @njit(cache=True, nogil=True, inline="always")
