@@ -136,8 +136,8 @@ class Run:
     """
 
     SIGMA_SOURCE: ClassVar = (
-        "posterior of the adjustment: draws from it, with the lidar's information divided by 4 because neighbouring returns share "
-        "errors; absolute position and heading are those of control, outside positions, GNSS and compass"
+        "posterior of the adjustment: what surfaces, the gyro between knots, lasting errors of the inertial units, GNSS and compass do "
+        "to the solution; absolute position and heading are those of control, outside positions, GNSS and compass"
     )
 
     windows: list[Window]
@@ -354,7 +354,7 @@ def of_ins(
 
 
 _UNITS: Final = {
-    "bias": "_deg_s", "scale": "", "shear": "", "turn": "_deg", "delay": "_s", "accel_bias": "_m_s2",
+    "bias": "_deg_s", "scale": "", "shear": "", "turn": "_deg", "delay": "_s", "drift": "", "accel_bias": "_m_s2",
     "accel_turn": "_deg", "lever": "_m",
     "compass": "_deg",
 }  # fmt: skip

@@ -31,17 +31,21 @@ from groundproc.adjustment.factors import (
     turn_factor,
 )
 from groundproc.adjustment.motion import ImuTrack, on_grid
+from groundproc.adjustment.noise import Carrying, Noise, noise_of
 from groundproc.adjustment.outside import DELAY, Outside, laid_by_pieces, outside_factors
 from groundproc.adjustment.planes import Clusters, rows_of
-from groundproc.adjustment.scans import SLICE_NS, STEPS
+from groundproc.adjustment.scans import SLICE_NS, STEP_NS, STEPS
 from groundproc.adjustment.solve import Problem, problem
 from groundproc.adjustment.spline import Path
 from groundproc.control import ControlPoint
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 ROUNDS: Final = ((1.0, False), (0.5, False), (0.5, True), (0.5, True))
 """Edge of the voxels [m], and whether outliers are cut, of each Gauss-Newton step."""
+ROUGH: Final = 1e-3
+"""Of a step that comes before outliers are cut, this share of what it gains may be missing."""
 MORE_ROUNDS: Final = 5
 SETTLED_M: Final = 0.003
 """The last step is taken again, so often at most, until the path's shape moves less than this, RMS."""
@@ -50,22 +54,28 @@ DEFLATION: Final = 4.0
 two sigmas (tests)."""
 WHOLE: Final = 1e-6
 """What the variance of the whole may lack [m^2, deg^2]."""
-EXACT: Final = 1e-8
-"""Covariances are exact to this share of the prior's variance; of what is known ten thousand times better, in variance, to 1e-4."""
 BLIND: Final = 50
 """Clusters of a slice below which it saw next to nothing."""
+EXACT: Final = 1e-8
+"""Of a covariance by weights no more than this share of the prior's variance is missing."""
+ENOUGH_OF_DRAWS: Final = 1e-3
+ENOUGH_OF_COLUMNS: Final = 3e-3
+"""What may be missing of a draw, as a share of all that it moves, and of a column of the inverse: of the variance that it stands for."""
 DRAWS: Final = 12
-"""Draws from the posterior that the sigmas are from: right to a fifth."""
+"""Draws of the path's error: its variance in itself is right to two fifths, and to less as a mean over a second."""
+LEVER_M: Final = 10.0
+"""How a turn counts against a shift where a path's own rigid part is told from it."""
 
 PRIORS: Final[dict[str, float]] = {
     "lidar.bias": np.deg2rad(50.0), "lidar.scale": 0.01, "lidar.shear": 0.01, "lidar.turn": np.deg2rad(0.3), "lidar.accel_bias": 0.5,
     "lidar.accel_turn": np.deg2rad(0.5), "lidar.lever": 0.15,
     "ins.bias": np.deg2rad(5.0), "ins.scale": 0.015, "ins.shear": 0.01, "ins.turn": np.deg2rad(3.0), "ins.accel_bias": 0.5,
-    "ins.accel_turn": np.deg2rad(0.5), "ins.lever": 0.05, "ins.delay": 0.01,
+    "ins.accel_turn": np.deg2rad(0.5), "ins.lever": 0.05, "ins.delay": 0.01, "ins.drift": 60e-6,
 }  # fmt: skip
 """What is known before, one sigma: gyro bias [rad/s], scale, what an axis feels of the two others (scales of axes that lie askew in the
 sensor's frame are of that kind), misalignment against the lidar's optics [rad], bias [m/s^2] and misalignment against the gyro of the
-accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s]."""
+accelerometer, place against the nominal one [m], delay beyond the synchronisation's [s] and how it drifts, two
+crystals against each other [s/s]."""
 COMPASS_PRIOR: Final = np.deg2rad([5.0, 10.0, 10.0, 4.0, 4.0])
 
 
@@ -170,10 +180,10 @@ class Batch:
             if unit.force_known.any():
                 names += ["accel_bias", "accel_turn", "lever"]
             if unit.name == "ins":
-                names.append("delay")
+                names += ["delay", "drift"]
             for name in names:
                 key = f"{unit.name}.{name}"
-                unknowns.add(key, np.full(1 if name == "delay" else 3, PRIORS[key]))
+                unknowns.add(key, np.full(1 if name in ("delay", "drift") else 3, PRIORS[key]))
         unknowns.add("compass", COMPASS_PRIOR)
         if self.outside:
             unknowns.add(DELAY, np.array([self.outside[0].delay_sigma_s]))
@@ -189,7 +199,7 @@ class Batch:
         rows = rows_of(self.clusters, self.path, voxel_m, self.most, cut)
         factors = self.factors(unknowns, weigh)
         linear = problem(rows, factors, unknowns, DEFLATION, self.path)
-        x, steps = linear.solve(-linear.gradient)
+        x, steps = linear.solve(-linear.gradient, share=0.0 if cut else ROUGH)
         cost, used = rows.cost()
         self.log.append(
             {
@@ -198,12 +208,22 @@ class Batch:
             | {f"{f.name}_rms": f.rms() for f in factors}
         )  # fmt: skip
         self.log[-1]["position_drift"] = drift(factors)
-        before = self.path.position_m[::STEPS]
+        before = self.path
         self.take(unknowns, x)
-        moved = self.path.position_m[::STEPS] - before
+        moved = (self.path.position_m - before.position_m)[::STEPS]
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(moved - moved.mean(axis=0)).sum(axis=1).mean()))
         self.told()
-        return Posterior(linear, unknowns, factors)
+        by = self.units[0]
+        carrying = Carrying(
+            f"{by.name} gyro",
+            np.asarray(by.known.reshape(-1, STEPS).all(axis=1)),
+            by.sigma_turn_rad / float(np.sqrt(STEPS)),
+        )
+        return Posterior(
+            linear,
+            unknowns,
+            lambda: noise_of(rows, self.clusters, before, DEFLATION, factors, x, carrying),
+        )
 
     def factors(self, unknowns: Unknowns, weigh: bool) -> list[Factor]:
         """Everything but the lidar."""
@@ -289,27 +309,108 @@ def drift(factors: Sequence[Factor]) -> float:
 
 
 @dataclass(slots=True)
+class Spread:
+    """Errors of a solution: draws, and columns for the part of their covariance that need not be drawn; each shape (n, unknowns).
+
+    Attributes
+    ----------
+    whole : ndarray
+        Draws.
+    anchored : ndarray
+        Of each draw, nearly the part that is the anchors': where the whole lies.
+    columns : ndarray
+        The covariance of `anchored` is the sum of their outer products.
+    """
+
+    whole: Array
+    anchored: Array
+    columns: Array
+
+    def variance(self, of: Callable[[Array], Array]) -> Array:
+        """Variance of linear functions of the unknowns, shape (...): what is known of it, and by draws what is not (control variates)."""
+        known = np.zeros_like(of(self.whole[0]))
+        for column in self.columns:
+            known += np.square(of(column))
+        left = np.zeros_like(known)
+        for whole, anchored in zip(self.whole, self.anchored, strict=True):
+            left += np.square(of(whole)) - np.square(of(anchored))
+        return np.asarray(known + np.maximum(left / len(self.whole), 0.0))
+
+    def without(self, unknowns: Sequence[slice]) -> "Spread":
+        """The same as if some unknowns were known."""
+        made = Spread(self.whole.copy(), self.anchored.copy(), self.columns.copy())
+        for part in (made.whole, made.anchored, made.columns):
+            for where in unknowns:
+                part[:, where] = 0.0
+        return made
+
+
+@dataclass(slots=True)
 class Posterior:
     """The last step's linear problem: covariances come from it."""
 
     problem: Problem
     unknowns: Unknowns
-    factors: list[Factor]
+    find_noise: Callable[[], Noise]
+    _noise: Noise | None = None
 
-    def draws(self, count: int, seed: int = 1) -> Array:
-        """Draws from the posterior about the solution, shape (count, unknowns): noise put through the same solution."""
+    @property
+    def noise(self) -> Noise:
+        """Where errors come from."""
+        if self._noise is None:
+            self._noise = self.find_noise()
+        return self._noise
+
+    def spread(self, count: int, seed: int = 1) -> Spread:
+        """So many draws of the error of the solution, noise put through the same solution; and what need not be drawn."""
         rng = np.random.default_rng(seed)
-        found = np.empty((count, self.unknowns.size))
+        whole, anchored = np.empty((2, count, self.unknowns.size))
         for i in range(count):
-            right = np.zeros(self.unknowns.size)
-            right[: self.problem.rows.size] = self.problem.rows.noise(rng) / np.sqrt(DEFLATION)
-            for factor in self.factors:
-                right += factor.matrix.T @ (rng.standard_normal(len(factor.sigma)) / factor.sigma)
-            found[i], _ = self.problem.solve(right, 0.05)
-        return found
+            right, of_anchors = self.noise.draw(rng)
+            whole[i] = self.told(self.problem.solve(right, 0.0, ENOUGH_OF_DRAWS)[0])
+            anchored[i] = self.told(self.problem.coarse.solve(of_anchors))
+        if self.problem.wide is not None:  # control holds the whole, and the coarse path does not know of it
+            return Spread(whole, 0.0 * anchored, np.zeros((0, self.unknowns.size)))
+        return Spread(whole, anchored, self.told(self.problem.coarse.spread_by(self.noise.anchors)).T)
+
+    def told(self, x: Array) -> Array:
+        """Solutions, shape (unknowns, ...), with the rigid part of the coefficients told by the whole's turn and shift.
+
+        Only the sum of both is known.
+        """
+        rigid, whole = self.problem.coarse.rigid, self._whole()
+        told = x.copy()
+        common = self._common() @ x[: len(rigid)]
+        told[: len(rigid)] -= rigid @ common
+        told[whole] += common
+        return told
+
+    def _common(self) -> Array:
+        """What is rigid in coefficients, shape (6, coefficients): a turn and a shift, by least squares."""
+        rigid = self.problem.coarse.rigid
+        weighed = rigid * np.tile([LEVER_M**2] * 3 + [1.0] * 3, len(rigid) // 6)[:, None]
+        return np.asarray(np.linalg.solve(weighed.T @ rigid, weighed.T))
+
+    def _whole(self) -> Ints:
+        """Where the whole's turn and shift stand, shape (6,)."""
+        names = self.unknowns.names
+        return np.concatenate([np.arange(names[n].start, names[n].stop) for n in ("world.turn", "world.shift")])
 
     def covariance(self, names: Sequence[str]) -> Array:
-        """Covariance of some globals, exactly, shape (m, m): the inverse's columns."""
+        """Covariance of some globals, without drawing, shape (m, m); of the whole's turn and shift as `told`."""
+        places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
+        whole, common = self._whole(), self._common()
+        seen = []
+        for place in places:
+            right = np.zeros(self.unknowns.size)
+            right[place] = 1.0
+            if place in whole:  # with what the path's coefficients have of it
+                right[: common.shape[1]] = common[int(np.flatnonzero(whole == place)[0])]
+            seen.append(self.noise.seen(self.problem.solve(right, 0.0, ENOUGH_OF_COLUMNS)[0]))
+        return np.asarray(np.array(seen) @ np.array(seen).T)
+
+    def weighed(self, names: Sequence[str]) -> Array:
+        """Covariance of some globals were the rows' weights right, shape (m, m): columns of the normal matrix's inverse."""
         places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
         prior = np.concatenate([self.unknowns.sigma[n] for n in names])
         columns = np.empty((len(places), len(places)))
@@ -361,9 +462,11 @@ def turned(vector: Array) -> Array:
 
 
 def place_on_grid(unit: Unit, track: ImuTrack, path: Path) -> None:
-    """Rates and forces of a unit on the path's grid, with its delay taken off the stamps."""
+    """Rates and forces of a unit on the path's grid, with its delay and what that drifts by taken off the stamps."""
     steps = path.intervals * STEPS
-    time_ns = track.time_ns - round(float(unit.values["delay"][0]) * 1e9)
+    since_middle_ns = track.time_ns - (path.start_ns + steps * STEP_NS // 2)
+    late_ns = 1e9 * float(unit.values["delay"][0]) + float(unit.values["drift"][0]) * since_middle_ns
+    time_ns = track.time_ns - np.rint(late_ns).astype(np.int64)
     unit.rate_rad_s, unit.known = on_grid(time_ns, track.rate_rad_s, path.start_ns, steps)
     unit.force_m_s2, unit.force_known = on_grid(time_ns, np.nan_to_num(track.force_m_s2), path.start_ns, steps)
     if not np.isfinite(track.force_m_s2).all():
@@ -374,7 +477,7 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
     """A unit with nothing estimated yet but its gyro's bias."""
     values = {
         "bias": bias.copy(), "scale": np.zeros(3), "shear": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1),
-        "accel_bias": np.zeros(3), "accel_turn": np.zeros(3), "lever": lever.copy(),
+        "drift": np.zeros(1),        "accel_bias": np.zeros(3), "accel_turn": np.zeros(3), "lever": lever.copy(),
     }  # fmt: skip
     none = np.zeros((0, 3))
     unit = Unit(

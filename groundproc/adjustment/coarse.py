@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from flightlog import frames
 from groundproc.adjustment.planes import Rows
@@ -27,6 +27,8 @@ EVERY: Final = 16
 """Coefficients from node to node, at least: 1.6 s."""
 MOST_NODES: Final = 160
 """Nodes at most, further apart on a long path: their dense matrix, six unknowns a node, is factored in every step."""
+LEAST_SHARE: Final = 1e-3
+"""Of all that is known of a direction."""
 COARSE_PARTS: Final = 4
 """Pieces that the voxels are shared out in between cores, each with a matrix of its own."""
 
@@ -81,6 +83,13 @@ class Nodes:
             (np.ravel(blocks), (np.ravel(rows), np.ravel(columns))), shape=(6 * count, 6 * len(self.centre_m))
         )
 
+    def rigid(self, prolongation: sparse.csr_matrix) -> Array:
+        """Coefficients of a turn about each local axis through the origin, and of a shift along each, shape (6 coefficients, 6)."""
+        count = len(self.centre_m)
+        motion = np.tile(np.eye(6), (count, 1, 1))
+        motion[:, 3:, :3] = np.cross(np.eye(3), self.centre_m[:, None]).swapaxes(1, 2)
+        return np.asarray(prolongation @ motion.reshape(6 * count, 6))
+
 
 def _coefficients(values: Array) -> Array:
     """Coefficients of the spline through values at the knots, shape (intervals + 1, ...), cubics exactly; straight beyond the ends."""
@@ -95,18 +104,33 @@ class Coarse:
 
     Attributes
     ----------
+    rigid : ndarray, shape (6 coefficients, 6)
+        What a turn about local axes through the origin, and a shift, of the whole path are in coefficients.
     prolongation : csr_matrix, shape (unknowns, 6 nodes + globals)
         From motions of nodes to coefficients; the globals are themselves.
     factor : tuple
         Cholesky factor of the normal matrix between nodes.
     """
 
+    rigid: Array
     prolongation: sparse.csr_matrix
     factor: Any
 
     def solve(self, right: Array) -> Array:
         """The best coarse solution, shape as `right`: (unknowns,) or (unknowns, m)."""
         return np.asarray(self.prolongation @ cho_solve(self.factor, self.prolongation.T @ right, check_finite=False))
+
+    def spread_by(self, rows: sparse.csr_matrix) -> Array:
+        """Columns, shape (unknowns, k): the sum of their outer products is the covariance by errors of size one of some rows.
+
+        Directions of which the rows say less than `LEAST_SHARE` are left out; there are a few dozen others.
+        """
+        between = rows @ self.prolongation
+        half = solve_triangular(self.factor[0], (between.T @ between).toarray(), trans="T", lower=self.factor[1])
+        shares, axes = np.linalg.eigh(solve_triangular(self.factor[0], half.T, trans="T", lower=self.factor[1]))
+        kept = shares > LEAST_SHARE
+        columns = solve_triangular(self.factor[0], axes[:, kept] * np.sqrt(shares[kept]), lower=self.factor[1])
+        return np.asarray(self.prolongation @ columns)
 
 
 def coarse_of(rows: Rows, deflation: float, normal: sparse.csr_matrix, path: Path) -> Coarse:
@@ -124,7 +148,7 @@ def coarse_of(rows: Rows, deflation: float, normal: sparse.csr_matrix, path: Pat
         matrix[:size, of_lasers] += border
         matrix[of_lasers, :size] += border.T
         matrix[of_lasers, of_lasers] += rows.lasers.corner / deflation
-    return Coarse(sparse.csr_matrix(prolongation), cho_factor(matrix, check_finite=False))
+    return Coarse(nodes.rigid(inner), sparse.csr_matrix(prolongation), cho_factor(matrix, check_finite=False))
 
 
 def lidar_between(rows: Rows, nodes: Nodes) -> Array:

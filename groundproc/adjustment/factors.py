@@ -156,8 +156,8 @@ class Unit:
         As measured, in the sensor frame by the nominal mount.
     known, force_known : ndarray of bool, shape (n STEPS,)
     values : dict of str to ndarray
-        bias [rad/s], scale, shear, turn [rad], delay [s], accel_bias [m/s^2], accel_turn [rad], lever [m]: what has
-        been taken off so far.
+        bias [rad/s], scale, shear, turn [rad], delay [s], accel_bias [m/s^2], accel_turn [rad], lever [m], drift
+        of the delay [s/s]: what has been taken off so far. The delay is that in the middle of the path.
     sigma_turn_rad, sigma_force_m_s2 : float
         Noise of an increment over a slice; of the mean force about a knot.
     """
@@ -228,7 +228,11 @@ def turn_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     if f"{name}.turn" in unknowns.names:
         builder.by(row, f"{name}.turn", cross(turned))
     if f"{name}.delay" in unknowns.names:
-        builder.by(row, f"{name}.delay", -(np.diff(knot_rates(path), axis=0)[good])[:, :, None])
+        later = -np.diff(knot_rates(path), axis=0)
+        since_middle_s = H * (np.arange(len(later)) + 0.5 - 0.5 * path.intervals)
+        builder.by(row, f"{name}.delay", later[good, :, None])
+        if f"{name}.drift" in unknowns.names:
+            builder.by(row, f"{name}.drift", (since_middle_s[:, None] * later)[good, :, None])
     return Factor(f"{name} gyro", residual.ravel(), builder.matrix(), np.full(3 * len(good), unit.sigma_turn_rad))
 
 

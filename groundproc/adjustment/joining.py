@@ -8,6 +8,7 @@ in a window: streets flown again after ten minutes close like those of the same 
 2023, in its idea). An hour has some 11 000 unknowns and a million patches: less than a window.
 """
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -19,9 +20,10 @@ from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from groundproc.adjustment.anchors import Attitudes, Positions, attitude_factor, fixes_name, position_factors
-from groundproc.adjustment.batch import COMPASS_PRIOR, DEFLATION, DRAWS, Posterior, turned, whole_covariance
+from groundproc.adjustment.batch import COMPASS_PRIOR, DEFLATION, DRAWS, Posterior, Spread, turned, whole_covariance
 from groundproc.adjustment.control import Held, held_to
 from groundproc.adjustment.factors import Factor, H, RowBuilder, Unknowns, cross, eye, prior_factor, whitened
+from groundproc.adjustment.noise import noise_of
 from groundproc.adjustment.outside import Outside, outside_factors
 from groundproc.adjustment.patches import Patches, coarse
 from groundproc.adjustment.planes import Clusters, Rows, placed, rows_of
@@ -70,20 +72,20 @@ class Stiffness:
     tilt: float
 
 
-def stiffness_of(path: Path, posterior: Posterior, draws: Array, stretched: float) -> Stiffness:
-    """Stiffness by draws from a window's posterior, the path's own part of which is to be `stretched`."""
-    names = posterior.unknowns.names
+def stiffness_of(path: Path, unknowns: Unknowns, draws: Array) -> Stiffness:
+    """Stiffness by draws from a window's posterior."""
+    names = unknowns.names
     mats = frames.mat_from_quat(path.quat[::STEPS])
     place = path.position_m[::STEPS]
     lag = max(min(round(WALK_S / H), len(mats) // 2), 1)
     turn, shift, tilt = np.zeros((len(mats) - lag, 3)), np.zeros((len(mats) - lag, 3)), 0.0
     for draw in draws:
-        rotation, moved = _at_knots(draw[: posterior.unknowns.path_size], mats)
+        rotation, moved = _at_knots(draw[: unknowns.path_size], mats)
         step = rotation[lag:] - rotation[:-lag]
         swept = np.cross(0.5 * (rotation[lag:] + rotation[:-lag]), place[lag:] - place[:-lag])
-        turn += np.square(stretched * step)
-        shift += np.square(stretched * (moved[lag:] - moved[:-lag] - swept))
-        leaning = (stretched * rotation + draw[names["world.turn"]])[:, :2]
+        turn += np.square(step)
+        shift += np.square(moved[lag:] - moved[:-lag] - swept)
+        leaning = (rotation + draw[names["world.turn"]])[:, :2]
         tilt += float(np.square(leaning).mean())
     spread = [_centred(s / (len(draws) * lag * H), lag, len(mats) - 1) for s in (turn, shift)]
     return Stiffness(
@@ -154,7 +156,7 @@ class Joining:
             last = self.step(voxel_m, cut)
         if self.control and self.control_clusters is not None:
             last = self._hold(last)
-        return self._joined(last, last.draws(DRAWS))
+        return self._joined(last.unknowns, last.spread(DRAWS))
 
     def _hold(self, last: Posterior) -> Posterior:
         """Lay the flight, which is right in itself, on the control as a whole, and adjust it with that."""
@@ -190,12 +192,12 @@ class Joining:
             {"voxel_m": voxel_m, "patches": len(seen), "rows": len(rows), "steps": steps} | _apart(rows, seen)
         )
         self.log[-1] |= {f"{factor.name}_rms": factor.rms() for factor in factors}
-        before = self.path.position_m
+        before = self.path
         path = self.path.corrected(x[: unknowns.path_size].reshape(-1, 6))
         self.path = path.turned(turned(x[unknowns.names["world.turn"]]), x[unknowns.names["world.shift"]])
         self.compass = self.compass + x[unknowns.names["compass"]]
-        self.log[-1]["moved_m"] = float(np.sqrt(np.square(self.path.position_m - before).sum(axis=1).mean()))
-        return Posterior(linear, unknowns, factors)
+        self.log[-1]["moved_m"] = float(np.sqrt(np.square(self.path.position_m - before.position_m).sum(axis=1).mean()))
+        return Posterior(linear, unknowns, lambda: noise_of(rows, seen.clusters, before, DEFLATION, factors, x))
 
     def factors(self, unknowns: Unknowns) -> list[Factor]:
         """Everything but the patches."""
@@ -215,27 +217,29 @@ class Joining:
         found.append(prior_factor(unknowns, {"compass": self.compass}))
         return found
 
-    def _joined(self, posterior: Posterior, draws: Array) -> "Joined":
-        """The correction, and its sigmas by draws."""
+    def _joined(self, unknowns: Unknowns, spread: Spread) -> "Joined":
+        """The correction, and its sigmas."""
         knots = slice(None, None, STEPS)
         mats, place = frames.mat_from_quat(self.path.quat[knots]), self.path.position_m[knots]
-        names = posterior.unknowns.names
+        names = unknowns.names
         heading = frames.attitude_of(mats @ self.mat_sensor_ins)[0]
-        position, attitude = np.zeros((len(mats), 3)), np.zeros((len(mats), 3))
-        for draw in draws:
-            rotation, moved = _at_knots(draw[: posterior.unknowns.path_size], mats)
-            whole = draw[names["world.turn"]]
+
+        def poses(x: Array) -> Array:
+            """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+            rotation, moved = _at_knots(x[: unknowns.path_size], mats)
+            whole = x[names["world.turn"]]
             turn = rotation + whole
-            position += np.square(moved + np.cross(whole, place) + draw[names["world.shift"]])
             forward = turn[:, 0] * np.sin(heading) + turn[:, 1] * np.cos(heading)
             right = turn[:, 0] * np.cos(heading) - turn[:, 1] * np.sin(heading)
-            attitude += np.square(np.stack([forward, right, turn[:, 2]], axis=1))
+            position = moved + np.cross(whole, place) + x[names["world.shift"]]
+            return np.stack([position, np.stack([forward, right, turn[:, 2]], axis=1)])
+
         at = np.arange(len(self.begin.quat)) / STEPS
         sigmas = [
-            np.stack([np.interp(at, np.arange(len(mats)), axis) for axis in np.sqrt(part / len(draws)).T], axis=1)
-            for part in (position, attitude)
+            np.stack([np.interp(at, np.arange(len(mats)), axis) for axis in part.T], axis=1)
+            for part in np.sqrt(spread.variance(poses))
         ]
-        sigma_compass = np.sqrt(np.square(draws[:, names["compass"]]).mean(axis=0))
+        sigma_compass = np.sqrt(spread.variance(operator.itemgetter(names["compass"])))
         told: list[dict[str, Any]] = []
         if self.held is not None and self.control_clusters is not None:
             told = self.held.report(self.control_clusters, self.path)

@@ -23,6 +23,9 @@ NAMES: Final = tuple(f"lasers.{kind}" for kind in KINDS)
 UNKNOWNS: Final = len(KINDS) * LASERS
 PRIOR: Final = np.repeat([0.02, np.deg2rad(0.1)], LASERS)
 """What the manual's table may be off by, one sigma: the data sheet's 2 cm, and an assumption of a thirteenth of their spacing."""
+STRETCH: Final = 2.0
+"""What the sigmas by the rows' weights are stretched by: found with simulated flights. The sandwich is too narrow for one laser against
+the others."""
 KNOWN: Final = 0.5
 """An offset counts as found where its sigma is below this share of what was known before."""
 
@@ -47,6 +50,11 @@ class LaserColumns:
     change: npt.NDArray[np.float32]
     border: Array
     corner: Array
+
+    def along(self, corrections: Array) -> Array:
+        """The rows times corrections, shape (UNKNOWNS,): shape (n,)."""
+        by_kind = corrections.reshape(len(KINDS), LASERS)
+        return np.asarray(np.einsum("nk,kn->n", self.change, by_kind[:, self.laser]))
 
     def gradient(self, projected: Array) -> Array:
         """Columns times weighed residuals less their planes, shape (n,): shape (UNKNOWNS,)."""

@@ -144,33 +144,32 @@ class Rows:
 
     def gradient(self) -> Array:
         """Half the gradient of the cost, same shape."""
-        return self._gradient(self.residual_m)
+        return self.spread(self.residual_m)
 
-    def _gradient(self, values: Array) -> Array:
-        """The columns of all unknowns times values of the rows, weighed and less their planes."""
+    def spread(self, values_m: Array) -> Array:
+        """The columns of all unknowns times values of the rows, shape (n,), weighed and less the best plane of each voxel."""
         out = np.zeros((PARTS, self.path_size))
         _gradient(
-            self.first,
-            self.knot,
-            self.weights,
-            self.jacobian,
-            self.plane,
-            self.weight,
-            self.inverse,
-            values,
-            out,
-        )
+            self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.inverse, values_m, out
+        )  # fmt: skip
         if self.lasers is None:
             return np.asarray(out.sum(axis=0))
-        projected = np.empty(len(values))
-        _project(self.first, self.plane, self.weight, self.inverse, values, projected)
-        return np.concatenate([out.sum(axis=0), self.lasers.gradient(projected)])
+        return np.concatenate([out.sum(axis=0), self.lasers.gradient(self._projected(values_m))])
 
-    def noise(self, rng: np.random.Generator) -> Array:
-        """A draw of what the noise of the rows does to the gradient: its covariance is the normal matrix."""
-        with np.errstate(divide="ignore"):
-            drawn = np.where(self.weight > 0, rng.standard_normal(len(self)) / np.sqrt(self.weight), 0.0)
-        return self._gradient(drawn)
+    def along(self, vector: Array) -> Array:
+        """The rows times a vector of unknowns, shape (n,)."""
+        out = np.empty(len(self))
+        _along(self.knot, self.weights, self.jacobian, vector[: self.path_size].reshape(-1, 6), out)
+        return out if self.lasers is None else out + self.lasers.along(vector[self.path_size :])
+
+    def seen(self, vector: Array) -> Array:
+        """The transpose of `spread`: the rows times a vector, weighed and less the best plane of each voxel, shape (n,)."""
+        return self._projected(self.along(vector))
+
+    def _projected(self, values_m: Array) -> Array:
+        out = np.empty(len(self))
+        _project(self.first, self.plane, self.weight, self.inverse, values_m, out)
+        return out
 
     def with_lasers(self, laser: npt.NDArray[np.int32], xyz_m: npt.NDArray[np.float32], normal: Array) -> None:
         """Take the corrections of the lasers in: each row's laser, its cluster and its plane's normal in the sensor frame."""
@@ -663,6 +662,13 @@ def _gradient(
                 r1 += y * plane[i, 0]
                 r2 += y * plane[i, 1]
             _spread_back(start, end, knot, weights, jacobian, plane, weight, inverse[v], r0, r1, r2, scratch, mine)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _along(knot: Any, weights: Any, jacobian: Any, vector: Any, out: Any) -> None:
+    """Each row times a vector of the path's unknowns."""
+    for i in range(len(knot)):
+        out[i] = _row(i, knot, weights, jacobian, vector)
 
 
 @njit(cache=True, nogil=True)

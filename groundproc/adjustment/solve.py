@@ -71,19 +71,24 @@ class Problem:
         out[:size] += self.rows.apply(vector[:size]) / self.deflation
         return np.asarray(out)
 
-    def solve(self, right: Array, enough: float = ENOUGH) -> tuple[Array, int]:
-        """Normal matrix x = right, by preconditioned conjugate gradients until less than `enough` is missing; and the steps it took."""
+    def solve(self, right: Array, enough: float = ENOUGH, share: float = 0.0) -> tuple[Array, int]:
+        """Normal matrix x = right, by preconditioned conjugate gradients; and the steps it took.
+
+        Until less than `enough` is missing in the cost, or less than a `share` of the whole.
+        """
         x, r = np.zeros_like(right), right.copy()
         z = self.near(r)
         p, rz = z.copy(), float(r @ z)
         gains: list[float] = []
         for step in range(1, MOST_STEPS + 1):
+            if rz <= 0.0:  # solved to the last digit
+                return x, step - 1
             image = self.apply(p)
             alpha = rz / float(p @ image)
             x += alpha * p
             r -= alpha * image
             gains.append(alpha * rz)
-            if step >= DELAY_STEPS and sum(gains[-DELAY_STEPS:]) < enough:
+            if step >= DELAY_STEPS and sum(gains[-DELAY_STEPS:]) < max(enough, share * sum(gains)):
                 return x, step
             z = self.near(r)
             before, rz = rz, float(r @ z)

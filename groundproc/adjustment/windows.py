@@ -3,6 +3,7 @@
 What is left between them after that is for `joining`.
 """
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -14,9 +15,9 @@ from scipy.ndimage import uniform_filter1d
 from flightlog import frames
 from groundproc.adjustment import lasers
 from groundproc.adjustment.anchors import Attitudes, Positions, Tie
-from groundproc.adjustment.batch import DRAWS, Batch, Posterior, joined, make_unit
+from groundproc.adjustment.batch import DRAWS, Batch, Posterior, Spread, joined, make_unit
 from groundproc.adjustment.control import kept_for, together
-from groundproc.adjustment.factors import H
+from groundproc.adjustment.factors import H, Unknowns
 from groundproc.adjustment.joining import Stiffness, stiffness_of
 from groundproc.adjustment.motion import ImuTrack, Motion
 from groundproc.adjustment.outside import DELAY, Outside
@@ -35,13 +36,12 @@ OVERLAP: Final = 200
 MISALIGNMENT_RAD: Final = np.deg2rad(0.2)
 """How far the axes of a cheap gyro are from those of its board (cross-axis sensitivity of its class, one sigma): the boresight is found
 through the gyro, and no flight tells the two apart."""
-RELATIVE: Final = 2.0
-"""What the path's own draws are stretched by: errors of the lidar along the flight are correlated over more than one slice. Found with
-simulated flights, where the draws alone were one to two times too small in position and two to four times in attitude."""
 LEVER_FLOOR_M: Final = 0.003
 """The same for the lever arm, which is found through accelerometers whose axes are no better."""
 UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
 """What the residuals do not show, by the global that it is in."""
+CALIBRATION: Final = ("ins.turn", "ins.lever", "ins.scale", "ins.delay", "ins.drift")
+"""What other flights go by: their covariance is not drawn, but solved for column by column."""
 
 
 @dataclass(slots=True)
@@ -180,20 +180,18 @@ def adjust_window(
         control=() if before or more else sources.control,
     )
     posterior = batch.run()
-    draws = posterior.draws(DRAWS)
-    values, seen = _values(batch, posterior, draws), None
+    spread = posterior.spread(DRAWS)
+    (values, exact), seen = _values(batch, posterior, spread, sources.exact), None
     if before or more:
-        stiffness = stiffness_of(batch.path, posterior, draws, RELATIVE)
+        stiffness = stiffness_of(batch.path, posterior.unknowns, spread.whole)
         control = kept_for(sources.control, gathered, batch.path, coarse(batch.path)) if sources.control else None
         seen = Seen(patches_of(gathered, batch.path, len(before)), stiffness, control)
         # how the whole lies is asked for when all windows are joined
-        for name in ("world.turn", "world.shift"):
-            draws[:, posterior.unknowns.names[name]] = 0.0
-    position, attitude = _sigmas(batch.path, posterior, draws, mat, lever, motion.rate_density)
-    exact = posterior.covariance(sources.exact) if sources.exact and set(sources.exact) <= set(values) else None
+        spread = spread.without([posterior.unknowns.names[name] for name in ("world.turn", "world.shift")])
+    position, attitude = _sigmas(batch.path, posterior.unknowns, spread, mat, lever, motion.rate_density)
     corrections = None
     if sources.lasers_apart:
-        corrections = batch.corrections, lasers.stretched(posterior.covariance(lasers.NAMES), RELATIVE)
+        corrections = batch.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
     held = [] if batch.held is None else batch.held.report(batch.clusters, batch.path)
     return Window(
         first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections, held, seen
@@ -215,64 +213,63 @@ def _laid_on(path: Path, tie: Tie) -> Path:
     return path.turned(mat, (tie.position_m - place @ mat.T).mean(axis=0))
 
 
-def _values(batch: Batch, posterior: Posterior, draws: Array) -> dict[str, tuple[Array, Array]]:
-    """Globals with the sigmas of the draws."""
+def _values(
+    batch: Batch, posterior: Posterior, spread: Spread, exact: tuple[str, ...]
+) -> tuple[dict[str, tuple[Array, Array]], Array | None]:
+    """Globals with their sigmas, and the covariance of those asked for."""
     found, common = {}, {"compass": batch.compass, DELAY: batch.outside_delay_s}
-    for name, where in posterior.unknowns.names.items():
+    names = posterior.unknowns.names
+    for name, where in names.items():
         unit, _, key = name.partition(".")
         if unit in ("world", "lasers"):
             continue
-        sigma = np.sqrt(np.mean(np.square(draws[:, where]), axis=0))
-        if name in common:
-            found[name] = (common[name], sigma)
-        else:
-            found[name] = (next(u for u in batch.units if u.name == unit).values[key], sigma)
-    return found
+        value = common[name] if name in common else next(u for u in batch.units if u.name == unit).values[key]
+        found[name] = (value, np.sqrt(spread.variance(operator.itemgetter(where))))
+    wanted = [name for name in dict.fromkeys((*exact, *CALIBRATION)) if name in names]
+    covariance = posterior.covariance(wanted)
+    at = 0
+    for name in wanted:
+        size = names[name].stop - names[name].start
+        found[name] = (found[name][0], np.sqrt(np.diag(covariance)[at : at + size]))
+        at += size
+    asked = sum(names[name].stop - names[name].start for name in exact if name in names)
+    return found, covariance[:asked, :asked] if exact and set(exact) <= set(found) else None
 
 
 def _sigmas(
-    path: Path, posterior: Posterior, draws: Array, mat_ins_lidar: Array, lever: Array, rate_density: float
+    path: Path, unknowns: Unknowns, spread: Spread, mat_ins_lidar: Array, lever: Array, rate_density: float
 ) -> tuple[Array, Array]:
     """Sigmas of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
-    unknowns = posterior.unknowns
     quat, place = path.quat[::STEPS], path.position_m[::STEPS]
     mats = frames.mat_from_quat(quat)
     to_ins = -mat_ins_lidar.T @ lever
-    squares_position, squares_attitude = np.zeros((len(quat), 3)), np.zeros((len(quat), 3))
     heading = frames.attitude_of(mats @ mat_ins_lidar.T)[0]
     right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
     ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
-    for draw in draws:
-        part = {name: draw[where] for name, where in unknowns.names.items()}
-        spline = draw[: unknowns.path_size].reshape(-1, 6)
-        at = _stretched((spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0, mats, place)
+
+    def poses(x: Array) -> Array:
+        """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+        part = {name: x[where] for name, where in unknowns.names.items()}
+        spline = x[: unknowns.path_size].reshape(-1, 6)
+        at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
         in_body = at[:, :3] + part.get("ins.turn", np.zeros(3))
         turn = np.einsum("nij,nj->ni", mats, in_body) + part["world.turn"]
         arm = np.cross(at[:, :3], to_ins) + part.get("ins.lever", np.zeros(3))
         moved = at[:, 3:] + np.cross(part["world.turn"], place) + part["world.shift"]
-        squares_position += np.square(moved + np.einsum("nij,nj->ni", mats, arm))
-        squares_attitude += np.square(
-            np.stack([(turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1), turn[:, 2]], axis=1)
+        position = moved + np.einsum("nij,nj->ni", mats, arm)
+        return np.stack(
+            [
+                position,
+                np.stack([(turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1), turn[:, 2]], axis=1),
+            ]
         )
+
+    position, attitude = uniform_filter1d(spread.variance(poses), 11, axis=1, mode="nearest")
     if "ins.turn" in unknowns.names:
-        squares_attitude += len(draws) * MISALIGNMENT_RAD**2
+        attitude = attitude + MISALIGNMENT_RAD**2
     # what the gyro adds between two knots, the mean of a Brownian bridge
     bridge = rate_density**2 * H / 6.0
-    position, attitude = (
-        uniform_filter1d(s / len(draws), 11, axis=0, mode="nearest") for s in (squares_position, squares_attitude)
-    )
     return np.sqrt(position), np.sqrt(attitude + bridge)
-
-
-def _stretched(at: Array, mats: Array, place: Array) -> Array:
-    """Turns in the body and shifts at the knots, shape (n, 6), with what is not of the whole times RELATIVE.
-
-    What moves the whole is shared between the spline and the world's own unknowns, of which only the sum means anything.
-    """
-    turn = np.einsum("nij,nj->ni", mats, at[:, :3]).mean(axis=0)
-    shift = np.cross(turn, place)
-    whole = np.concatenate([turn @ mats, shift + (at[:, 3:] - shift).mean(axis=0)], axis=1)
-    return np.asarray(whole + RELATIVE * (at - whole))
 
 
 def joined_path(windows: Sequence[Window]) -> Path:

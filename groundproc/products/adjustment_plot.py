@@ -27,14 +27,14 @@ BLIND_BELOW: Final = 50
 """Matched clusters of a tenth of a second below which the lidar has next to no planes."""
 AXES_OF: Final = {
     "bias": "x y z", "scale": "x y z", "turn": "x y z", "accel_bias": "x y z", "accel_scale": "x y z", "accel_turn": "x y z",
-    "lever": "x y z", "delay": "", "compass": "const sin cos sin2 cos2",
+    "lever": "x y z", "delay": "", "drift": "", "compass": "const sin cos sin2 cos2",
 }  # fmt: skip
 """What the numbers of an estimated parameter are of."""
 UNITS_OF: Final = {
     "bias": "deg/s", "scale": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_scale": "%", "accel_turn": "deg",
-    "lever": "cm", "delay": "ms", "compass": "deg",
+    "lever": "cm", "delay": "ms", "drift": "ppm", "compass": "deg",
 }  # fmt: skip
-FACTORS: Final = {"scale": 100.0, "accel_scale": 100.0, "lever": 100.0, "delay": 1000.0}
+FACTORS: Final = {"scale": 100.0, "accel_scale": 100.0, "lever": 100.0, "delay": 1000.0, "drift": 1e6}
 """From the unit of quality.json to that of the table, where they differ."""
 DOT: Final[dict[str, Any]] = {"marker": ".", "linestyle": "", "markersize": 3}
 

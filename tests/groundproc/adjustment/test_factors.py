@@ -81,12 +81,12 @@ def unknowns_of(*names: str) -> Unknowns:
     unknowns.add("world.turn", np.ones(3))
     unknowns.add("world.shift", np.ones(3))
     for name in names:
-        unknowns.add(name, np.ones({"ins.delay": 1, "compass": 5}.get(name, 3)))
+        unknowns.add(name, np.ones({"ins.delay": 1, "ins.drift": 1, "compass": 5}.get(name, 3)))
     return unknowns
 
 
 UNIT_NAMES = tuple(
-    f"ins.{name}" for name in ("bias", "scale", "shear", "turn", "accel_bias", "accel_turn", "lever", "delay")
+    f"ins.{name}" for name in ("bias", "scale", "shear", "turn", "accel_bias", "accel_turn", "lever", "delay", "drift")
 )
 
 
@@ -98,7 +98,7 @@ def changed_unit(unit: Unit, track: ImuTrack, path: Path, name: str, change: Arr
     else:
         values[name] = values[name] + change
     made = replace(unit, values=values)
-    if name == "delay":
+    if name in ("delay", "drift"):
         place_on_grid(made, track, path)
     return made
 
@@ -154,7 +154,14 @@ def test_what_a_gyro_says_is_linear_as_stated(path: Path, unit: Unit) -> None:
     track = samples(400.0, LEVER)
     dense = factor.matrix.toarray()
     # by the slice's whole turn at once: it is up to 0.09 rad, and by so much the second order may differ
-    for name, size in (("bias", 1e-4), ("scale", 1e-4), ("shear", 1e-4), ("turn", 1e-4), ("delay", 1e-3)):
+    for name, size in (
+        ("bias", 1e-4),
+        ("scale", 1e-4),
+        ("shear", 1e-4),
+        ("turn", 1e-4),
+        ("delay", 1e-3),
+        ("drift", 1e-3),
+    ):
         where = unknowns.names[f"ins.{name}"]
         columns = []
         for c in range(where.stop - where.start):

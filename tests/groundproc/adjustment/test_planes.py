@@ -112,15 +112,14 @@ def test_the_cost_is_what_dense_least_squares_leave(rows: Rows) -> None:
     assert used == int((rows.weight > 0).sum())
 
 
-def test_noise_has_the_normal_matrix_for_its_covariance(rows: Rows) -> None:
-    """A quadratic form of many draws: its mean is right to sqrt(2 / draws); four of those are allowed."""
-    rng, draws = np.random.default_rng(2), 400
-    normal, _ = reduced(rows)
-    found = np.array([rows.noise(rng) for _ in range(draws)])
-    for direction in np.random.default_rng(3).normal(size=(5, SIZE)):
-        expected = direction @ normal @ direction
-        assert np.mean((found @ direction) ** 2) == pytest.approx(expected, rel=4.0 * np.sqrt(2.0 / draws))
-    assert np.abs(found.mean(axis=0) / np.sqrt(np.maximum(np.diag(normal), 1.0))).max() < 4.5 / np.sqrt(draws) + 0.05
+def test_what_the_rows_see_is_the_transpose_of_what_they_spread(rows: Rows) -> None:
+    rng = np.random.default_rng(2)
+    values, vector = rng.normal(size=len(rows)), rng.normal(size=SIZE)
+    by_path, _, _ = dense(rows)
+    np.testing.assert_allclose(rows.along(vector), by_path @ vector, atol=1e-9 * np.abs(by_path @ vector).max())
+    assert rows.spread(values) @ vector == pytest.approx(values @ rows.seen(vector), rel=1e-9)
+    # the normal matrix is what is spread of what is along
+    np.testing.assert_allclose(rows.spread(rows.along(vector)), rows.apply(vector), rtol=1e-7, atol=1e-3)
 
 
 def test_the_band_is_the_normal_matrix_with_the_planes_known(rows: Rows) -> None:
