@@ -146,7 +146,7 @@ def judged_flight(simulated: Callable[..., Simulated]) -> Simulated:
     """20 s round the village with all errors and a boresight that is off; the true echoes are there."""
     from simulator.config import MountOptions, Options
 
-    options = replace(Options(), mount=MountOptions((0.6, -0.5, 0.8), (0.01, -0.02, 0.01)))
+    options = replace(Options(), mount=MountOptions(boresight_deg=(0.6, -0.5, 0.8), lever_m=(0.01, -0.02, 0.01)))
     return simulated("judged_flight", "village", 20.0, options, every=10, points=True)
 
 
