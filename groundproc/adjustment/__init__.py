@@ -6,11 +6,14 @@ voxels      a map of planes in a hash of voxels
 odometry    slice after slice against the map of those before: an iterated error-state filter; the causal mode
 track       the forward pass: start, silent slices, fixes, loss of way
 beginning   the first seconds again, backwards
-planes      what the lidar says, with the planes solved for within
-factors     what everything else says; anchors: what ties the path to the earth
+planes      what the lidar says, with the planes solved for within; lasers: each laser's own offsets with them
+factors     what everything else says; anchors, outside: what ties the path to the earth
+control     surveyed points and planes; surfaces: the map where they lie; datum: the map laid on them as a whole
+coarse      slow bends, the preconditioner's second level
 solve       one Gauss-Newton step by conjugate gradients
+noise       where errors come from, for the sigmas
 batch       all of them, and the posterior
-windows     of a long flight
+windows     of a long flight; patches: the ground that several saw; joining: one adjustment over them all
 adjusted    the method
 mount_calibration  the mount of several flights
 spline      uniform cubic B-splines
