@@ -26,15 +26,15 @@ Array = npt.NDArray[np.float64]
 BLIND_BELOW: Final = 50
 """Matched clusters of a tenth of a second below which the lidar has next to no planes."""
 AXES_OF: Final = {
-    "bias": "x y z", "scale": "x y z", "turn": "x y z", "accel_bias": "x y z", "accel_scale": "x y z", "accel_turn": "x y z",
+    "bias": "x y z", "scale": "x y z", "shear": "yz zx xy", "turn": "x y z", "accel_bias": "x y z", "accel_turn": "x y z",
     "lever": "x y z", "delay": "", "drift": "", "compass": "const sin cos sin2 cos2",
 }  # fmt: skip
 """What the numbers of an estimated parameter are of."""
 UNITS_OF: Final = {
-    "bias": "deg/s", "scale": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_scale": "%", "accel_turn": "deg",
+    "bias": "deg/s", "scale": "%", "shear": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_turn": "deg",
     "lever": "cm", "delay": "ms", "drift": "ppm", "compass": "deg",
 }  # fmt: skip
-FACTORS: Final = {"scale": 100.0, "accel_scale": 100.0, "lever": 100.0, "delay": 1000.0, "drift": 1e6}
+FACTORS: Final = {"scale": 100.0, "shear": 100.0, "lever": 100.0, "delay": 1000.0, "drift": 1e6}
 """From the unit of quality.json to that of the table, where they differ."""
 DOT: Final[dict[str, Any]] = {"marker": ".", "linestyle": "", "markersize": 3}
 
@@ -271,6 +271,7 @@ def _table(estimated: dict[str, Any]) -> list[tuple[list[str], bool]]:
         name = {
             "turn": "boresight" if key.startswith("ins.") else "misalignment",
             "lever": "place",
+            "shear": "cross-axis",
             "accel_turn": "accel misalignment",
         }.get(base, base)
         factor = FACTORS.get(base, 1.0)
