@@ -71,7 +71,7 @@ def write_atomically(path: Path, text: str, *, sync: bool = True) -> None:
             data = data[file.write(data) :]
         if sync:
             os.fsync(file.fileno())
-    os.replace(temporary, path)  # noqa: PTH105 - as above, each second
+    os.replace(temporary, path)  # noqa: PTH105 - each second, and a path as an object costs most of the time
     if sync:
         sync_directory(path.parent)
 

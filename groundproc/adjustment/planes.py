@@ -672,21 +672,26 @@ def _along(knot: Any, weights: Any, jacobian: Any, vector: Any, out: Any) -> Non
 
 
 @njit(cache=True, nogil=True)
+def _best_plane(start: int, end: int, plane: Any, weight: Any, inverse: Any, values: Any) -> Any:
+    """Offset and tilts of the plane that fits the values of a voxel's rows best."""
+    r0, r1, r2 = 0.0, 0.0, 0.0
+    for i in range(start, end):
+        y = weight[i] * values[i]
+        r0 += y
+        r1 += y * plane[i, 0]
+        r2 += y * plane[i, 1]
+    return (
+        inverse[0] * r0 + inverse[1] * r1 + inverse[2] * r2,
+        inverse[1] * r0 + inverse[3] * r1 + inverse[4] * r2,
+        inverse[2] * r0 + inverse[4] * r1 + inverse[5] * r2,
+    )
+
+
+@njit(cache=True, nogil=True)
 def _project(first: Any, plane: Any, weight: Any, inverse: Any, values: Any, out: Any) -> None:
     """Values of the rows less the best plane of each voxel, weighed."""
     for v in range(len(first) - 1):
-        r0, r1, r2 = 0.0, 0.0, 0.0
-        for i in range(first[v], first[v + 1]):
-            y = weight[i] * values[i]
-            r0 += y
-            r1 += y * plane[i, 0]
-            r2 += y * plane[i, 1]
-        q = inverse[v]
-        d, a, b = (
-            q[0] * r0 + q[1] * r1 + q[2] * r2,
-            q[1] * r0 + q[3] * r1 + q[4] * r2,
-            q[2] * r0 + q[4] * r1 + q[5] * r2,
-        )
+        d, a, b = _best_plane(first[v], first[v + 1], plane, weight, inverse[v], values)
         for i in range(first[v], first[v + 1]):
             out[i] = weight[i] * _off_plane(i, plane, values, d, a, b)
 
@@ -754,18 +759,7 @@ def _band(knot: Any, weights: Any, jacobian: Any, weight: Any, out: Any) -> None
 def _cost(first: Any, plane: Any, weight: Any, inverse: Any, residual: Any) -> float:
     total = 0.0
     for v in range(len(first) - 1):
-        r0, r1, r2 = 0.0, 0.0, 0.0
-        for i in range(first[v], first[v + 1]):
-            y = weight[i] * residual[i]
-            r0 += y
-            r1 += y * plane[i, 0]
-            r2 += y * plane[i, 1]
-        q = inverse[v]
-        d, a, b = (
-            q[0] * r0 + q[1] * r1 + q[2] * r2,
-            q[1] * r0 + q[3] * r1 + q[4] * r2,
-            q[2] * r0 + q[4] * r1 + q[5] * r2,
-        )
+        d, a, b = _best_plane(first[v], first[v + 1], plane, weight, inverse[v], residual)
         for i in range(first[v], first[v + 1]):
             total += weight[i] * _off_plane(i, plane, residual, d, a, b) ** 2
     return total
