@@ -20,10 +20,12 @@ import velodyne_decoder
 
 from flightlog import clock, hdl32e, mavlink
 from flightlog.frames import mat_local_ins, quat_from_mat
-from groundproc import autopilot, decode, georeference, timebase, timeline
+from groundproc.cloud import georeference
+from groundproc.flight import autopilot, timebase, timeline
+from groundproc.flight.sync import GyroTrack
+from groundproc.flight.timeline import LidarRun
 from groundproc.geodesy import LocalFrame
-from groundproc.sync import GyroTrack
-from groundproc.timeline import LidarRun
+from groundproc.sensors import hdl32e as decode
 from groundproc.trajectory.table import from_poses
 from simulator.config import Options
 from simulator.render import Job, Simulation

@@ -35,19 +35,19 @@ from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy.alignment import align
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
-from groundproc.calibration.options import ROBUST, SOURCE, DynamicOptions
-from groundproc.calibration.revolutions import revolutions
-from groundproc.calibration.search import Found, Search
-from groundproc.calibration.trims import applied, interpolated
-from groundproc.cloud import Tally, chunks
-from groundproc.decode import Gate
-from groundproc.flight import read_flight
-from groundproc.georeference import georeference
-from groundproc.mounting import find_mount
+from groundproc.cloud.georeference import georeference
+from groundproc.cloud.placing import Tally, chunks
+from groundproc.estimation import methods
+from groundproc.estimation.dynamic.options import ROBUST, SOURCE, DynamicOptions
+from groundproc.estimation.dynamic.revolutions import revolutions
+from groundproc.estimation.dynamic.search import Found, Search
+from groundproc.estimation.dynamic.trims import applied, interpolated
+from groundproc.estimation.method import Given, gather
+from groundproc.flight.flight import read_flight
+from groundproc.flight.mounting import find_mount
+from groundproc.flight.timeline import Leg, legs
+from groundproc.sensors.hdl32e import Gate
 from groundproc.survey import Survey
-from groundproc.timeline import Leg, legs
-from groundproc.trajectory import methods
-from groundproc.trajectory.method import Given, gather
 from groundproc.trajectory.trajectory import Trajectory
 
 mpl.use("Agg")

@@ -27,7 +27,7 @@ from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader, LogWriter, Message
 from flightlog.mavlink import Frame, FrameParser
-from groundproc import load
+from groundproc.flight import load
 
 Address = tuple[str, int, int]
 """Link, system, component."""

@@ -37,14 +37,14 @@ from flightlog.mount import Mount
 from groundproc.accuracy.cloud import Section, choose_section
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import Clock, Truth, on_lidar_clock, read_truth
-from groundproc.decode import LaserTable
-from groundproc.flight import read_flight
-from groundproc.mounting import find_mount
+from groundproc.estimation import methods
+from groundproc.estimation.method import gather
+from groundproc.flight.flight import read_flight
+from groundproc.flight.mounting import find_mount
+from groundproc.flight.sync.result import Sync
+from groundproc.flight.timeline import legs
+from groundproc.sensors.hdl32e import LaserTable
 from groundproc.survey import Survey
-from groundproc.sync.result import Sync
-from groundproc.timeline import legs
-from groundproc.trajectory import methods
-from groundproc.trajectory.method import gather
 from groundproc.trajectory.trajectory import Trajectory
 
 ROOT: Final = Path(__file__).resolve().parents[1]

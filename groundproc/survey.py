@@ -5,7 +5,7 @@ from typing import Final
 
 from flightlog.config import option
 from flightlog.mount import Mount
-from groundproc.calibration.options import DynamicOptions
+from groundproc.estimation.dynamic.options import DynamicOptions
 
 METHODS: Final = ("best", "adjusted", "filtered", "dynamic", "ins")
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from flightlog import frames
 from flightlog.mount import Mount
+from groundproc.flight.timeline import Leg, LidarRun
 from groundproc.geodesy import LocalFrame
-from groundproc.timeline import Leg, LidarRun
 from groundproc.trajectory.table import from_poses
 from groundproc.trajectory.trajectory import Trajectory
 

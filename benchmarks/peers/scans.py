@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.logfile import LogReader
-from groundproc import decode, load
 from groundproc.accuracy.cloud import GATE
+from groundproc.flight import load
+from groundproc.sensors import hdl32e as decode
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]

@@ -15,14 +15,16 @@ from numba import njit
 from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
-from groundproc import decode, load
 from groundproc.accuracy import patches
 from groundproc.accuracy.alignment import Rigid
 from groundproc.accuracy.ground import LEVEL, Ground, cell_keys
 from groundproc.accuracy.patches import ESTIMATED, FLOOR, Moments
 from groundproc.accuracy.truth import Truth, shot_numbers
-from groundproc.decode import Gate, LaserTable
-from groundproc.georeference import Points, georeference
+from groundproc.cloud.georeference import georeference
+from groundproc.cloud.points import Points
+from groundproc.flight import load
+from groundproc.sensors import hdl32e as decode
+from groundproc.sensors.hdl32e import Gate, LaserTable
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

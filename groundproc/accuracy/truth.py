@@ -20,8 +20,8 @@ from flightlog.constants import HOUR_NS
 from flightlog.errors import LogError
 from flightlog.hdl32e import FIRING_NS, LASER_NS, LASERS
 from flightlog.mount import Mount
+from groundproc.flight.timeline import Line
 from groundproc.geodesy import LocalFrame
-from groundproc.timeline import Line
 from groundproc.trajectory.table import read_trajectory
 from groundproc.trajectory.trajectory import Trajectory
 

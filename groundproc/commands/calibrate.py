@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from groundproc.adjustment.mount_calibration import FlightResult, MountCalibration
+    from groundproc.estimation.calibration.mount import FlightResult, MountCalibration
 
 HELP = "find boresight, lever arm, clock offset, compass curve and corrections of the lasers from flights: files for later flights"
 
@@ -41,13 +41,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from flightlog.logfile import LogReader
-    from groundproc.adjustment.mount_calibration import calibrate
-    from groundproc.calibration.compass import write_compass
-    from groundproc.calibration.lasers import write_lasers
+    from groundproc.estimation.calibration.compass import write_compass
+    from groundproc.estimation.calibration.mount import calibrate
     from groundproc.files import made_folder, written_aside
-    from groundproc.mounting import find_mount
+    from groundproc.flight.mounting import find_mount
     from groundproc.products.laser_plot import draw_lasers
     from groundproc.progress import stages
+    from groundproc.sensors.lasers import write_lasers
 
     logs = arguments.logs
     if len(set(logs)) < len(logs):
@@ -85,14 +85,14 @@ def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> Fli
     """One flight."""
     from flightlog.errors import LogError
     from flightlog.logfile import LogReader
-    from groundproc.adjustment import adjusted
-    from groundproc.adjustment.mount_calibration import COMPASS, SHARED, flight_result
-    from groundproc.calibration.lasers import ESTIMATE
-    from groundproc.flight import read_flight
+    from groundproc.estimation.adjustment import adjusted
+    from groundproc.estimation.calibration.mount import COMPASS, SHARED, flight_result
+    from groundproc.estimation.method import gather
+    from groundproc.estimation.methods import ins_estimate
+    from groundproc.flight.flight import read_flight
+    from groundproc.flight.timeline import legs
+    from groundproc.sensors.lasers import ESTIMATE
     from groundproc.survey import Survey
-    from groundproc.timeline import legs
-    from groundproc.trajectory.method import gather
-    from groundproc.trajectory.methods import ins_estimate
 
     with LogReader(path) as reader:
         survey = Survey(method="adjusted", lasers=ESTIMATE if with_lasers else None)

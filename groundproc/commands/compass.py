@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit and write."""
-    from groundproc.calibration.compass import fit_compass, write_compass
-    from groundproc.calibration.dynamic import settled_run
+    from groundproc.estimation.calibration.compass import fit_compass, write_compass
+    from groundproc.estimation.dynamic.dynamic import settled_run
 
     paths = [path / "trims.csv" if path.is_dir() else path for path in arguments.trims]
     curve = fit_compass([settled_run(path) for path in paths], arguments.harmonics)

@@ -22,10 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Decode, with a progress bar on a terminal."""
     from flightlog.errors import UsageError
-    from groundproc.decode import Gate
-    from groundproc.options import field_of_view
+    from groundproc.commands.values import field_of_view
+    from groundproc.products.sensor_cloud import write_sensor_cloud
     from groundproc.progress import stages
-    from groundproc.sensor_cloud import write_sensor_cloud
+    from groundproc.sensors.hdl32e import Gate
 
     if not 0.0 <= arguments.min_range <= arguments.max_range:
         raise UsageError(

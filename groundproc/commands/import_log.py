@@ -29,8 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.mount import load_mount
-    from groundproc.importers.flight import import_flight
-    from groundproc.importers.sources import Ports
+    from groundproc.flight.importers.flight import import_flight
+    from groundproc.flight.importers.sources import Ports
 
     attachments = {}
     if arguments.mount is not None:

@@ -19,8 +19,8 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.logfile import LogReader
-    from groundproc.summary.log import summarise
-    from groundproc.summary.text import as_text
+    from groundproc.flight.summary.log import summarise
+    from groundproc.flight.summary.text import as_text
 
     with LogReader(arguments.log) as reader:
         hidden = not sys.stderr.isatty()

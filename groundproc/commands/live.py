@@ -124,9 +124,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> Any:
-    from groundproc.decode import Gate
+    from groundproc.commands.values import field_of_view
     from groundproc.live.estimator import Options
-    from groundproc.options import field_of_view
+    from groundproc.sensors.hdl32e import Gate
 
     fov = field_of_view(arguments.fov) if arguments.fov else (255.0, 105.0)
     patience_ns = 400_000_000 if arguments.follow is None else 2_000_000_000
@@ -135,7 +135,7 @@ def _options(arguments: argparse.Namespace) -> Any:
 
 def _mount(arguments: argparse.Namespace) -> Mount:
     from flightlog.logfile import LogReader
-    from groundproc.mounting import find_mount
+    from groundproc.flight.mounting import find_mount
 
     chosen = None if arguments.mount is None else str(arguments.mount)
     if arguments.follow is None:

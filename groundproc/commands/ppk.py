@@ -48,7 +48,7 @@ class _ShowConfig(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from flightlog import config
-        from groundproc.positions.ppk import PpkOptions
+        from groundproc.flight.positions.ppk import PpkOptions
 
         print(config.dump(PpkOptions()), end="")
         parser.exit()
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.errors import UsageError
-    from groundproc.positions.ppk import Base, base_position, process
+    from groundproc.flight.positions.ppk import Base, base_position, process
 
     if arguments.base_position is not None and arguments.base_average:
         raise UsageError("--base-position and --base-average: one of the two")
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _options(arguments: argparse.Namespace) -> Any:
     """The options of the file with those of the command line before them."""
     from flightlog import config
-    from groundproc.positions.ppk import PpkOptions
+    from groundproc.flight.positions.ppk import PpkOptions
 
     options = config.load(arguments.config, PpkOptions) if arguments.config else PpkOptions()
     named = {

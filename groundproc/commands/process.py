@@ -70,8 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Process, with a progress bar on a terminal."""
-    from groundproc.pipeline import process
     from groundproc.progress import stages
+    from groundproc.steps.pipeline import process
 
     survey = _survey(arguments)
     with stages(
@@ -93,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _survey(arguments: argparse.Namespace) -> Survey:
     """The survey file with the command line's options laid over it."""
     from flightlog import config
-    from groundproc.calibration.lasers import ESTIMATE
-    from groundproc.options import field_of_view, milliseconds
+    from groundproc.commands.values import field_of_view, milliseconds
+    from groundproc.sensors.lasers import ESTIMATE
     from groundproc.survey import Survey
 
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pull; 0 when every closed segment is here and right, else 1."""
-    from groundproc.pull import Vehicle, pull
+    from groundproc.field.pull import Vehicle, pull
 
     vehicle = Vehicle(arguments.host, arguments.port, arguments.identity, arguments.ssh_config)
 

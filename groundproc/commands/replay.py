@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Play, with a progress bar on a terminal."""
     from tqdm import tqdm
 
-    from groundproc.replay import Destination, Replayed, parse_mavlink, parse_speed, replay
+    from groundproc.field.replay import Destination, Replayed, parse_mavlink, parse_speed, replay
 
     to = Destination(
         arguments.host,

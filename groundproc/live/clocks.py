@@ -12,11 +12,11 @@ from flightlog import nmea
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mavlink import Frame
-from groundproc import timebase, timeline
+from groundproc.flight import timebase, timeline
+from groundproc.flight.load import Sentence
+from groundproc.flight.sync import GyroTrack
+from groundproc.flight.timeline import Leg, LidarRun
 from groundproc.live.telemetry import newest_boot
-from groundproc.load import Sentence
-from groundproc.sync import GyroTrack
-from groundproc.timeline import Leg, LidarRun
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]

@@ -11,10 +11,11 @@ from flightlog import frames
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
-from groundproc.adjustment.motion import INS_FORCES, LEAST_BASE_HZ, Motion
-from groundproc.adjustment.scans import SLICE_NS, Slice
-from groundproc.adjustment.spline import Path
-from groundproc.adjustment.track import (
+from groundproc.estimation import ins
+from groundproc.estimation.adjustment.motion import INS_FORCES, LEAST_BASE_HZ, Motion
+from groundproc.estimation.adjustment.scans import SLICE_NS, Slice
+from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.adjustment.track import (
     ATTITUDE_EVERY_NS,
     ATTITUDE_FIX_RAD,
     FIX_TAU_S,
@@ -24,16 +25,15 @@ from groundproc.adjustment.track import (
     Track,
     Tracker,
 )
-from groundproc.autopilot import Boot
-from groundproc.decode import Gate
+from groundproc.flight.autopilot import Boot
+from groundproc.flight.sync import GyroTrack
 from groundproc.geodesy import LocalFrame
 from groundproc.live.clocks import LidarTimes, Synchroniser, Tie
 from groundproc.live.motion import GrowingMotion, MotionBuilder, Samples
 from groundproc.live.slicer import Shots, Slicer
 from groundproc.live.start import RoughPoses, autopilot_poses, gyro_offset
 from groundproc.live.telemetry import Telemetry
-from groundproc.sync import GyroTrack
-from groundproc.trajectory import ins
+from groundproc.sensors.hdl32e import Gate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.adjustment.motion import CUBIC_BELOW_HZ, ImuTrack, on_grid
-from groundproc.adjustment.scans import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.adjustment.motion import CUBIC_BELOW_HZ, ImuTrack, on_grid
+from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -84,7 +84,7 @@ def white_noise(samples: Array) -> float:
 
 
 class GrowingMotion:
-    """What `groundproc.adjustment.motion.Motion` is, for a flight that goes on.
+    """What `groundproc.estimation.adjustment.motion.Motion` is, for a flight that goes on.
 
     Parameters
     ----------

@@ -9,12 +9,12 @@ import numpy as np
 from flightlog import frames
 from flightlog.errors import SourceError
 from groundproc import geodesy
+from groundproc.cloud import las
 from groundproc.files import written_aside
+from groundproc.flight.positions.posetable import COLUMNS
 from groundproc.geodesy import LocalFrame
 from groundproc.live.estimator import Place
 from groundproc.live.voxelcloud import VoxelCloud
-from groundproc.products import las
-from groundproc.trajectory.table import COLUMNS
 
 MORE_COLUMNS: Final = ("lidar_ns", "matched", "seen", "residual_m", "lag_s")
 _FORMATS: Final = "%.9f,%.9f,%.4f,%.4f,%.4f,%.4f,%.5f,%.5f,%.5f,%.4f,%.4f,%.4f,%.4f,%.4f,%.4f"

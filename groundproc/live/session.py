@@ -14,7 +14,8 @@ import numpy.typing as npt
 from flightlog import hdl32e, records
 from flightlog.constants import NS_PER_S, STANDARD_GRAVITY_M_S2
 from flightlog.hdl32e import POSITION_BYTES
-from groundproc import load
+from groundproc.flight import load
+from groundproc.flight.load import DeviceClock, PositionBatch
 from groundproc.geodesy import LocalFrame
 from groundproc.live.estimator import Estimator, Figures, Options, Place
 from groundproc.live.inbox import Inbox, Received
@@ -22,7 +23,6 @@ from groundproc.live.products import LiveTrajectory, write_cloud
 from groundproc.live.receivers import Counts
 from groundproc.live.telemetry import Telemetry
 from groundproc.live.voxelcloud import VoxelCloud
-from groundproc.load import DeviceClock, PositionBatch
 
 SILENT_S: Final = 2.0
 """Without a packet for so long the lidar is said to be silent."""

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc import decode
-from groundproc.adjustment.scans import SLICE_NS
-from groundproc.decode import Gate
+from groundproc.estimation.adjustment.scans import SLICE_NS
+from groundproc.sensors import hdl32e as decode
+from groundproc.sensors.hdl32e import Gate
 
 _MOST_AHEAD: Final = 40
 """Slices that may wait for the motion; what comes farther ahead is dropped."""

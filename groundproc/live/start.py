@@ -5,13 +5,13 @@ import numpy.typing as npt
 
 from flightlog.errors import LogError
 from flightlog.mount import Mount
-from groundproc.adjustment.scans import STEP_NS
-from groundproc.adjustment.spline import integrated
-from groundproc.autopilot import Boot
+from groundproc.estimation import ins
+from groundproc.estimation.adjustment.scans import STEP_NS
+from groundproc.estimation.adjustment.spline import integrated
+from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
 from groundproc.live.clocks import Tie
 from groundproc.live.motion import GrowingMotion, Samples
-from groundproc.trajectory import ins
 from groundproc.trajectory.trajectory import Poses, Trajectory
 
 Array = npt.NDArray[np.float64]

@@ -7,8 +7,8 @@ from flightlog import mavlink
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame, FrameParser
-from groundproc import autopilot
-from groundproc.autopilot import REBOOT_MS, Boot
+from groundproc.flight import autopilot
+from groundproc.flight.autopilot import REBOOT_MS, Boot
 
 KEPT_NS: Final = 60 * NS_PER_S
 _MOST: Final = 60_000

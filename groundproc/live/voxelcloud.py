@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.adjustment.rotations import mat_of_quat
-from groundproc.adjustment.scans import STEP_NS, spread, voxel_key
-from groundproc.adjustment.spline import Path
+from groundproc.estimation.adjustment.scans import STEP_NS
+from groundproc.estimation.adjustment.spline import Path
+from groundproc.numerics.rotations import mat_of_quat
+from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 

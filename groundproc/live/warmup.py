@@ -5,15 +5,15 @@ from typing import cast
 import numpy as np
 
 from flightlog import hdl32e, records
-from groundproc.adjustment.motion import Motion
-from groundproc.adjustment.odometry import Odometry, State
-from groundproc.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
-from groundproc.adjustment.spline import Path, integrated
-from groundproc.decode import Gate
+from groundproc.estimation.adjustment.motion import Motion
+from groundproc.estimation.adjustment.odometry import Odometry, State
+from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
+from groundproc.estimation.adjustment.spline import Path, integrated
 from groundproc.geodesy import LocalFrame
 from groundproc.live.motion import GrowingMotion
 from groundproc.live.slicer import Slicer
 from groundproc.live.voxelcloud import VoxelCloud
+from groundproc.sensors.hdl32e import Gate
 from groundproc.trajectory.trajectory import Trajectory
 
 

@@ -12,13 +12,13 @@ from matplotlib.ticker import FormatStrFormatter
 from matplotlib.transforms import Bbox
 
 from flightlog import frames
-from groundproc.adjustment.adjusted import CausalRun, Run, attitude_track, position_track
-from groundproc.adjustment.anchors import Attitudes, Positions
-from groundproc.adjustment.scans import STEP_NS, STEPS
-from groundproc.adjustment.spline import Path as SensorPath
-from groundproc.adjustment.track import boundaries_ns
+from groundproc.estimation.adjustment.adjusted import CausalRun, Run, attitude_track, position_track
+from groundproc.estimation.adjustment.anchors import Attitudes, Positions
+from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
+from groundproc.estimation.adjustment.spline import Path as SensorPath
+from groundproc.estimation.adjustment.track import boundaries_ns
+from groundproc.estimation.method import Given
 from groundproc.files import written_aside
-from groundproc.trajectory.method import Given
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ from pyproj.exceptions import CRSError
 from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError, SourceError
 from groundproc.files import written_aside
-from groundproc.positions.scales import EPOCH_NS, WEEK_NS, utc_from_gps_calendar
+from groundproc.flight.positions.scales import EPOCH_NS, WEEK_NS, utc_from_gps_calendar
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError
-from groundproc import control
+from groundproc.flight import control
 from groundproc.strips.clusters import CLUSTER
 from groundproc.strips.rows import CONTROL
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.adjustment.scans import spread, voxel_key
+from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.adjustment.rotations import flattest
+from groundproc.numerics.rotations import flattest
 from groundproc.strips.clusters import Gatherer
 
 Array = npt.NDArray[np.float64]

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,8 @@ from groundproc.strips.adjust import Adjusted, Sigmas
 from groundproc.strips.cutting import BIN_NS, Strips, headings_differ
 from groundproc.strips.differences import Differences
 from groundproc.strips.route import as_trajectory
+from groundproc.strips.site import Site
 from groundproc.trajectory.table import write_trajectory
-
-if TYPE_CHECKING:
-    from groundproc.strips.work import Site
 
 Array = npt.NDArray[np.float64]
 
@@ -51,7 +49,7 @@ class Moved:
 class Facts:
     """All that the report is made of."""
 
-    site: "Site"
+    site: Site
     strips: Strips
     voxel_m: float
     sigmas: Sigmas

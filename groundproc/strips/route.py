@@ -10,9 +10,9 @@ import pyproj
 
 from flightlog import frames
 from flightlog.errors import GeodesyError, LogError
+from groundproc.flight.positions.reading import read_solution
+from groundproc.flight.positions.solution import Solution
 from groundproc.geodesy import LocalFrame
-from groundproc.positions.reading import read_solution
-from groundproc.positions.solution import Solution
 from groundproc.trajectory.table import from_poses
 from groundproc.trajectory.trajectory import Trajectory
 

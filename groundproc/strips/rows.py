@@ -12,9 +12,9 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog import frames
-from groundproc.adjustment.planes import CUT, HUBER, TILT_PRIOR, Rows
-from groundproc.adjustment.rotations import flattest
-from groundproc.adjustment.scans import voxel_key
+from groundproc.estimation.adjustment.planes import CUT, HUBER, TILT_PRIOR, Rows
+from groundproc.numerics.rotations import flattest
+from groundproc.numerics.voxelhash import voxel_key
 from groundproc.strips.correction import Correction
 
 Array = npt.NDArray[np.float64]

@@ -10,13 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 
-from flightlog import frames
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError, SwathError, UsageError
 from groundproc.files import made_folder
 from groundproc.strips import report
 from groundproc.strips.adjust import COARSEST_M, MOST_INTERVALS, Adjusted, Sigmas, adjust
-from groundproc.strips.clouds import Chunk, Clock, Cloud, agreed_crs, chunks, look, rewriters
+from groundproc.strips.clouds import Clock, agreed_crs, chunks, look, rewriters
 from groundproc.strips.clusters import CLUSTER, Gatherer
 from groundproc.strips.control import as_clusters, read_control
 from groundproc.strips.correction import Correction
@@ -25,6 +24,7 @@ from groundproc.strips.density import Density
 from groundproc.strips.differences import Differences, Patches
 from groundproc.strips.options import HOLD, StripOptions
 from groundproc.strips.route import Route, read_route
+from groundproc.strips.site import Site
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -68,29 +68,6 @@ class Task:
     undulation_m: float = 0.0
     control: Path | None = None
     options: StripOptions = field(default_factory=StripOptions)
-
-
-@dataclass(slots=True)
-class Site:
-    """Clouds, trajectory and strips of a task."""
-
-    clouds: Sequence[Cloud]
-    clock: Clock
-    route: Route
-    options: StripOptions
-    outside: int = 0
-
-    def placed(self, chunk: Chunk) -> tuple[npt.NDArray[np.bool_], Array, Array, Array]:
-        """Which points have a pose, and for all of them place less the origin, scanner, and attitude; shape (n, 3) and (n, 4)."""
-        poses, covered = self.route.poses.where_covered(chunk.time_ns)
-        quat = poses.quat_local_ins_wxyz
-        quat[~covered] = (1.0, 0.0, 0.0, 0.0)
-        scanner = poses.position_m
-        lever = np.array(self.options.lever_arm_m)
-        if lever.any():
-            scanner = scanner + np.einsum("nij,j->ni", frames.mat_from_quat(quat), lever)
-        scanner[~covered] = 0.0
-        return covered, chunk.xyz_m - self.route.origin_m, scanner, quat
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:

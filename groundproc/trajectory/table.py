@@ -7,17 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.errors import LogError
 from groundproc.files import written_aside
+from groundproc.flight.positions.posetable import COLUMNS, read_pose_table
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
-COLUMNS: Final = (
-    "utc_ns", "latitude_deg", "longitude_deg", "height_m", "east_m", "north_m", "up_m", "roll_deg", "pitch_deg", "heading_deg",
-    "sigma_east_m", "sigma_north_m", "sigma_up_m", "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
-)  # fmt: skip
 _FORMATS: Final = "%.9f,%.9f,%.4f,%.4f,%.4f,%.4f,%.5f,%.5f,%.5f,%.4f,%.4f,%.4f,%.4f,%.4f,%.4f"
 LONGEST_STEP_NS: Final = 1_000_000_000
 """Rows further apart than this are the two sides of a gap."""
@@ -55,7 +51,7 @@ def read_trajectory(path: Path, frame: LocalFrame | None = None) -> Trajectory:
     Parameters
     ----------
     path : Path
-        Needed: utc_ns, latitude_deg, longitude_deg, height_m, roll_deg, pitch_deg, heading_deg; other columns are optional.
+        Columns as `read_pose_table` wants them.
     frame : LocalFrame, optional
         Default: its origin is the first row.
 
@@ -64,32 +60,12 @@ def read_trajectory(path: Path, frame: LocalFrame | None = None) -> Trajectory:
     LogError
         The file cannot be read, a column is missing, a value is no number, or the times do not increase.
     """
-    try:
-        names, stamps, table = _read(path)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror})") from None
-    needed = [
-        n
-        for n in ("latitude_deg", "longitude_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
-        if n not in names
-    ]
-    if needed:
-        raise LogError(f"{path}: column {needed[0]} is missing; a trajectory has {', '.join(COLUMNS[:10])}")
-    if len(stamps) < 2 or not (np.diff(stamps) > 0).all():
-        raise LogError(f"{path}: {len(stamps)} rows, expected two or more with increasing utc_ns")
-    column = {name: table[:, i] for i, name in enumerate(names)}
-    place = [column[n] for n in ("latitude_deg", "longitude_deg", "height_m")]
-    frame = frame or LocalFrame(*(float(values[0]) for values in place))
-    position = frame.from_geodetic(*place)
-    angles = (np.deg2rad(column[n]) for n in ("heading_deg", "pitch_deg", "roll_deg"))
-    quat = frames.quat_from_mat(frames.mat_local_ins(*angles))
+    table = read_pose_table(path)
+    frame = frame or LocalFrame(float(table.latitude_deg[0]), float(table.longitude_deg[0]), float(table.height_m[0]))
+    position = frame.from_geodetic(table.latitude_deg, table.longitude_deg, table.height_m)
     return from_poses(
-        frame, stamps, position, quat, _sigmas(column, _POSITION_SIGMAS), np.deg2rad(_sigmas(column, _ATTITUDE_SIGMAS))
+        frame, table.time_ns, position, table.quat_local_ins_wxyz, table.sigma_position_m, table.sigma_attitude_rad
     )
-
-
-_POSITION_SIGMAS: Final = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
-_ATTITUDE_SIGMAS: Final = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg")
 
 
 def from_poses(
@@ -120,49 +96,3 @@ def _at_knots(slope: Array, step_s: Array, joined: npt.NDArray[np.bool_]) -> Arr
     summed[:-1] += weight * slope
     summed[1:] += weight * slope
     return np.asarray(summed / np.where(total > 0.0, total, 1.0))
-
-
-def _sigmas(column: dict[str, Array], names: tuple[str, ...]) -> Array:
-    """Columns of sigma; where a file has none they are not a number, which says that nobody stated them."""
-    some = next(iter(column.values()))
-    return np.stack([column.get(name, np.full(len(some), np.nan)) for name in names], axis=1)
-
-
-def _read(path: Path) -> tuple[list[str], npt.NDArray[np.int64], Array]:
-    """Names of the columns that mean something here, stamps, and the values, shape (n, names)."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        header = [name.strip() for name in file.readline().split(",")]
-        if "utc_ns" not in header:
-            raise LogError(f"{path}: the first line has no column utc_ns; a trajectory has {', '.join(COLUMNS[:10])}")
-        names: list[str] = [name for name in COLUMNS if name in header]
-        places = [header.index(name) for name in names]
-        stamps, rows = [], []
-        for number, line in enumerate(file, 2):
-            words = line.strip().split(",")
-            if words == [""]:
-                continue
-            row = _numbers([words[place] for place in places], names) if len(words) == len(header) else None
-            if row is None:
-                raise LogError(
-                    f"{path}: line {number} is not {len(header)} values, utc_ns a whole number and the pose one that can be"
-                )
-            stamps.append(row[0])
-            rows.append(row[1])
-    return names, np.array(stamps, np.int64), np.array(rows, np.float64).reshape(len(rows), len(names))
-
-
-def _numbers(words: list[str], names: list[str]) -> tuple[int, list[float]] | None:
-    """The stamp, exactly, and all values of a row, the stamp first; None where one is no number or no pose."""
-    try:
-        stamp, values = int(words[0]), [float(word) for word in words]
-    except ValueError:
-        return None
-    for name, value in zip(names, values, strict=True):
-        # a sigma may be missing
-        if not name.startswith("sigma") and not abs(value) <= _LARGEST.get(name, 1e9):
-            return None
-    return stamp, values
-
-
-_LARGEST: Final = {"utc_ns": 2.0**62, "latitude_deg": 90.0, "longitude_deg": 360.0}
-"""Magnitudes that values of a pose cannot exceed."""

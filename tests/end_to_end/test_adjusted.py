@@ -12,13 +12,13 @@ import pytest
 from flightlog.logfile import LogReader, LogWriter
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
-from groundproc.adjustment import adjusted, windows
-from groundproc.adjustment.track import Track
-from groundproc.flight import read_flight
+from groundproc.estimation import methods
+from groundproc.estimation.adjustment import adjusted, windows
+from groundproc.estimation.adjustment.track import Track
+from groundproc.estimation.method import Estimate, gather
+from groundproc.flight.flight import read_flight
+from groundproc.flight.timeline import legs
 from groundproc.survey import Survey
-from groundproc.timeline import legs
-from groundproc.trajectory import methods
-from groundproc.trajectory.method import Estimate, gather
 
 SECONDS = 20.0
 

@@ -17,13 +17,13 @@ from flightlog import frames
 from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
-from groundproc.adjustment import adjusted, windows
 from groundproc.cli import main
-from groundproc.flight import read_flight
+from groundproc.estimation import methods
+from groundproc.estimation.adjustment import adjusted, windows
+from groundproc.estimation.method import Estimate, Given, gather
+from groundproc.flight.flight import read_flight
+from groundproc.flight.timeline import legs
 from groundproc.survey import Survey
-from groundproc.timeline import legs
-from groundproc.trajectory import methods
-from groundproc.trajectory.method import Estimate, Given, gather
 
 Array = npt.NDArray[np.float64]
 SECONDS = 20.0

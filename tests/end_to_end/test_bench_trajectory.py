@@ -16,8 +16,8 @@ from flightlog import frames
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy.truth import read_truth
-from groundproc.flight import read_flight
-from groundproc.timeline import legs
+from groundproc.flight.flight import read_flight
+from groundproc.flight.timeline import legs
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 KEYS = {
@@ -76,7 +76,7 @@ def test_a_method_that_fails_says_why_and_the_others_go_on(judged_flight: Any, t
 def test_every_method_of_the_command_line_takes_part() -> None:
     from trajectory import own_methods
 
-    from groundproc.trajectory.methods import METHODS
+    from groundproc.estimation.methods import METHODS
 
     assert set(own_methods()) >= set(METHODS)
 

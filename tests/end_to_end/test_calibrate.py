@@ -13,15 +13,15 @@ from flightlog.hdl32e import LASERS
 from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
-from groundproc.calibration.compass import BINS, read_compass
-from groundproc.calibration.dynamic import with_compass
-from groundproc.calibration.lasers import ESTIMATE, read_lasers
 from groundproc.cli import main
-from groundproc.flight import read_flight
+from groundproc.estimation import methods
+from groundproc.estimation.calibration.compass import BINS, read_compass
+from groundproc.estimation.dynamic.dynamic import with_compass
+from groundproc.estimation.method import Estimate, gather
+from groundproc.flight.flight import read_flight
+from groundproc.flight.timeline import legs
+from groundproc.sensors.lasers import ESTIMATE, read_lasers
 from groundproc.survey import Survey
-from groundproc.timeline import legs
-from groundproc.trajectory import methods
-from groundproc.trajectory.method import Estimate, gather
 
 SECONDS = 20.0
 

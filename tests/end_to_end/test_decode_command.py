@@ -9,9 +9,9 @@ import pytest
 import velodyne_decoder
 
 from flightlog.logfile import LogReader
-from groundproc import load
 from groundproc.cli import main
-from groundproc.decode import Gate, decode
+from groundproc.flight import load
+from groundproc.sensors.hdl32e import Gate, decode
 
 
 def run(output: Path, *words: Any) -> laspy.LasData:

@@ -244,7 +244,7 @@ def test_the_sync_of_the_report_is_the_true_one(
     truth = plain_flight.truth["clocks"]
     times_s = np.asarray(plain.cloud.gps_time) + 1e9 + 315_964_800 - LEAP_S - truth["utc"]["start_ns"] * 1e-9
     with LogReader(plain_flight.log) as reader:
-        from groundproc import load
+        from groundproc.flight import load
 
         first = next(load.lidar_batches([reader])).packets["data"][0]
     sent_s = (int(first["stamp_us"]) * 1e-6 - truth["lidar"]["start_ns"] * 1e-9) / (

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundproc import pull
 from groundproc.cli import main
+from groundproc.field import pull
 from onboard.daemon import boot_id
 from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status, to_json
 

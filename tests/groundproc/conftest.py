@@ -107,7 +107,7 @@ def pcap() -> Callable[..., bytes]:
 def tlog_frames(recordings: Path) -> Callable[[str], list["Frame"]]:
     """Frames of a recorded telemetry log: each of its records is a big-endian time in microseconds and bytes."""
     from flightlog.mavlink import FrameParser
-    from groundproc.importers import tlog
+    from groundproc.flight.importers import tlog
 
     def read(name: str) -> list["Frame"]:
         parser, found = FrameParser(), []

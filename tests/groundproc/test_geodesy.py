@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flightlog.errors import GeodesyError
+from groundproc.cloud.georeference import project
 from groundproc.geodesy import (
     LARGEST_RESIDUAL_M,
     LocalFrame,
@@ -19,7 +20,6 @@ from groundproc.geodesy import (
     utm_epsg,
     with_sea_level,
 )
-from groundproc.georeference import project
 
 Array = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from flightlog import config
 from flightlog.errors import ConfigError
 from flightlog.logfile import LogReader, LogWriter
 from flightlog.mount import Mount
-from groundproc.mounting import find_mount
+from groundproc.flight.mounting import find_mount
 from groundproc.survey import Survey
 
 

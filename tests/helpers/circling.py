@@ -5,10 +5,10 @@ import numpy.typing as npt
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.adjustment.factors import Factor, Unknowns, prior_factor
-from groundproc.adjustment.planes import Clusters
-from groundproc.adjustment.scans import STEP_NS, STEPS
-from groundproc.adjustment.spline import Path
+from groundproc.estimation.adjustment.factors import Factor, Unknowns, prior_factor
+from groundproc.estimation.adjustment.planes import Clusters
+from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
+from groundproc.estimation.adjustment.spline import Path
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 70

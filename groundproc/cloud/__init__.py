@@ -1,0 +1,1 @@
+"""Shots and poses to points in the world, and clouds as files."""

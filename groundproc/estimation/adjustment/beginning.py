@@ -1,0 +1,101 @@
+"""The first seconds again, backwards in time: when they were flown there was no map yet, and now there is one of all that came after.
+
+At the start the odometry has only the inertial sensors' unknown biases and a wall or two to go by, and may slide metres along them
+before it knows better. So it is run once more from a moment when it did, with time reversed: rates and velocities change sign, forces
+and gravity do not.
+"""
+
+import copy
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from flightlog import frames
+from groundproc.estimation.adjustment.motion import Motion
+from groundproc.estimation.adjustment.odometry import STATES, Odometry, State, Step
+from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
+from groundproc.estimation.adjustment.track import KEPT, Track, thinned
+from groundproc.estimation.adjustment.voxels import PlaneMap
+
+BEGINNING: Final = 150
+"""Slices that are run again."""
+AFTER: Final = 600
+"""Slices after them that make the map."""
+SIGMA: Final = np.repeat([np.deg2rad(0.02), 0.02, 0.2, np.deg2rad(0.05), 0.05, 0.05], STATES // 6)
+"""What is known at that moment: attitude, position, velocity, biases, gravity."""
+SURE_M: Final = 0.15
+"""Sigma of position beyond which the second run is not taken."""
+
+
+def redo_beginning(track: Track, motion: Motion, early: Sequence[Slice], state: State) -> None:
+    """Run the first slices again and put the result into the track.
+
+    Parameters
+    ----------
+    track : Track
+    motion : Motion
+    early : sequence of Slice
+        The first slices.
+    state : State
+        Of the odometry at the end of the track: biases and gravity, which are known by then.
+    """
+    count = min(BEGINNING, len(track) // 3)
+    if count < 20:
+        return
+    end_ns = motion.start_ns + (track.first + count) * SLICE_NS
+    grid = slice(track.first * STEPS, (track.first + count) * STEPS)
+    if not motion.known[grid].all():
+        return
+    reversed_motion = Motion(
+        0, -motion.rate_rad_s[grid][::-1], motion.force_m_s2[grid][::-1].copy(), motion.known[grid][::-1],
+        motion.rate_density, motion.force_density, motion.source,
+    )  # fmt: skip
+    begin = State(
+        track.quat[count].copy(), track.position_m[count].copy(), -track.velocity_m_s[count - 1],
+        -track.gyro_bias[count - 1], state.accel_bias_m_s2.copy(), state.gravity_m_s2.copy(), np.diag(SIGMA**2),
+    )  # fmt: skip
+    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m)
+    odometry.map = _map_of(track, motion, count, min(count + AFTER, len(track)))
+    found: dict[int, tuple[State, Step | None]] = {}
+    for piece in reversed(early):
+        k = piece.number - track.first
+        if not 0 <= k < count:
+            continue
+        while odometry.number < count - 1 - k:  # nothing was seen
+            odometry.propagate(odometry.number)
+            found[count - odometry.number] = copy.deepcopy(odometry.state), None
+        laser = None if piece.laser is None else piece.laser[::-1].copy()
+        step = odometry.step(Slice(count - 1 - k, end_ns - piece.time_ns[::-1], piece.xyz_m[::-1].copy(), laser))
+        found[k] = copy.deepcopy(odometry.state), step
+    while odometry.number < count:
+        odometry.propagate(odometry.number)
+        found[count - odometry.number] = copy.deepcopy(odometry.state), None
+    # where the planes do not hold it, it is no better than what was there
+    if max(float(np.sqrt(np.diag(state.covariance)[3:6].max())) for state, _ in found.values()) > SURE_M:
+        return
+    for k, (at, seen) in found.items():
+        track.quat[k], track.position_m[k] = at.quat, at.position_m
+        track.velocity_m_s[k], track.gyro_bias[k] = -at.velocity_m_s, -at.gyro_bias_rad_s
+        track.sigma[k] = np.sqrt(np.diag(at.covariance)[:6])
+        if seen is None:
+            continue
+        # all of a slice's clusters again, for the old ones were made with a wrong motion
+        clusters = seen.clusters.copy()
+        clusters["time_ns"] = end_ns - clusters["time_ns"]
+        track.clusters[k] = thinned(clusters, seen.world_m, odometry.map, KEPT)
+        track.matched[k], track.residual_m[k] = seen.matched, seen.residual_m
+
+
+def _map_of(track: Track, motion: Motion, first: int, last: int) -> PlaneMap:
+    """The planes of slices `first` to `last`."""
+    planes = PlaneMap(track.voxel_m)
+    path = track.path(motion, first, last)
+    for clusters in track.clusters[first:last]:
+        if not len(clusters):
+            continue
+        place = np.clip((clusters["time_ns"] - path.start_ns) // STEP_NS, 0, len(path.quat) - 1)
+        mats = frames.mat_from_quat(path.quat[place])
+        world = np.einsum("nij,nj->ni", mats, clusters["xyz"].astype(np.float64)) + path.position_m[place]
+        planes.insert(world, clusters, Odometry.MOST)
+    return planes

@@ -1,0 +1,246 @@
+"""Where the errors of a solution come from, as they are and not as they are weighed: the middle of the sandwich N^-1 (S S^T) N^-1.
+
+The weights of the normal matrix N are those of independent rows. Errors are not: what a plane is not, or an edge, is in all rows of
+its voxel and of its neighbours; what the gyro's noise does between two knots is in all returns of that moment, and no spline follows it;
+what the model of a unit lacks lasts for seconds. `Noise` is S: it turns independent numbers of size one, several for each source, into
+what that source does to the gradient.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from flightlog import frames
+from groundproc.estimation.adjustment.factors import Factor
+from groundproc.estimation.adjustment.planes import Clusters, Rows
+from groundproc.estimation.adjustment.scans import STEPS
+from groundproc.estimation.adjustment.spline import Path, basis
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+LASTING_ROWS: Final = 20
+"""Rows on end (of a tenth of a second each) whose errors are taken to go together: what lasts longer is found as a bias or a scale."""
+
+
+ANCHORS: Final = ("position", "attitude", "outside")
+"""Factors that say where the whole lies begin with these words."""
+PATCH_M: Final = 4.0
+"""Edge of the cubes within which what a surface is not goes together: with larger ones the spread of simulated flights grows no more."""
+
+
+@dataclass(slots=True)
+class Noise:
+    """The sources of errors of one linear problem.
+
+    Attributes
+    ----------
+    rows : Rows
+    deflation : float
+        What the lidar's information is divided by in the normal matrix.
+    off_m : ndarray, shape (rows,)
+        Distances from the voxels' mean planes at the solution: they are the errors, with a sign for each patch (wild bootstrap by groups).
+    patch : ndarray of int64, shape (rows,)
+        Number of the patch of surface that each row is of.
+    step : ndarray of int64, shape (rows,)
+        Grid step that each row's cluster lies in.
+    turning : ndarray, shape (rows, 3)
+        Rows by a turn about local axes.
+    follow : csr_matrix, shape (grid, grid)
+        From a course over the grid to what a spline of the path follows of it.
+    walk_rad : float
+        Noise of the carrying gyro's turn over a grid step.
+    carrier : Carrier or None
+        Its factor.
+    others : csr_matrix, shape (m, unknowns)
+        Rows of the other factors, each for an error of size one.
+    anchors : csr_matrix, shape (k, unknowns)
+        The same of what says where the whole lies, and of the priors.
+    """
+
+    rows: Rows
+    deflation: float
+    off_m: Array
+    patch: Ints
+    step: Ints
+    turning: Array
+    follow: sparse.csr_matrix
+    walk_rad: float
+    carrier: "Carrier | None"
+    others: sparse.csr_matrix
+    anchors: sparse.csr_matrix
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """How many numbers each source takes: a sign for a patch, turns of grid steps about three axes, rows of factors and anchors."""
+        patches = int(self.patch.max(initial=-1)) + 1
+        return patches, 3 * self.follow.shape[0], self.others.shape[0], self.anchors.shape[0]
+
+    def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        """One draw of the gradient, shape (unknowns,), and the part of it that is the anchors'."""
+        patches, turns, others, anchors = self.sizes
+        anchored = self.anchors.T @ rng.standard_normal(anchors)
+        local = self.gradient(
+            rng.choice([-1.0, 1.0], patches), rng.standard_normal(turns), rng.standard_normal(others), np.zeros(anchors)
+        )
+        return local + anchored, anchored
+
+    def gradient(self, signs: Array, turns: Array, others: Array, anchors: Array) -> Array:
+        """S times a vector, given in its parts."""
+        course = np.cumsum(self.walk_rad * turns.reshape(-1, 3), axis=0)
+        followed = self.follow @ course
+        bent = np.einsum("ni,ni->n", self.turning, (course - followed)[self.step])
+        right: Array = np.array(self.others.T @ others + self.anchors.T @ anchors, np.float64)
+        right[: self.rows.size] += self.rows.spread(self.off_m * signs[self.patch] + bent) / self.deflation
+        if self.carrier is not None:
+            right = right + self.carrier.gradient(followed)
+        return np.asarray(right)
+
+    def seen(self, vector: Array) -> Array:
+        """S^T times a vector of unknowns: what each of the independent numbers does to the linear function that it stands for."""
+        patches, _, _, _ = self.sizes
+        by_row = self.rows.seen(vector[: self.rows.size]) / self.deflation
+        signs = np.bincount(self.patch, by_row * self.off_m, patches)
+        grid = self.follow.shape[0]
+        moments = np.stack([np.bincount(self.step, by_row * axis, grid) for axis in self.turning.T], axis=1)
+        followed = 0.0 if self.carrier is None else self.carrier.seen(vector, grid)
+        course = moments + self.follow.T @ (followed - moments)
+        turns = self.walk_rad * np.cumsum(course[::-1], axis=0)[::-1]
+        return np.concatenate([signs, turns.ravel(), self.others @ vector, self.anchors @ vector])
+
+
+@dataclass(slots=True)
+class Carrier:
+    """The factor of the gyro whose turns are the path's motion between knots: what the path follows of its noise is in its rows.
+
+    Attributes
+    ----------
+    factor : Factor
+    interval : ndarray of int64, shape (n,)
+        Of each three rows.
+    mats : ndarray, shape (n, 3, 3)
+        Local from sensor at the interval's end.
+    """
+
+    factor: Factor
+    interval: Ints
+    mats: Array
+
+    def gradient(self, followed: Array) -> Array:
+        """What a course on the grid, about local axes, does to the gradient."""
+        knots = followed[::STEPS]
+        turn = (knots[1:] - knots[:-1])[self.interval]
+        rows = np.einsum("nji,nj->ni", self.mats, turn).ravel()
+        return np.asarray(self.factor.matrix.T @ (rows / self.factor.sigma**2))
+
+    def seen(self, vector: Array, grid: int) -> Array:
+        """The transpose of it, shape (grid, 3)."""
+        rows = (self.factor.matrix @ vector / self.factor.sigma**2).reshape(-1, 3)
+        turn = np.einsum("nij,nj->ni", self.mats, rows)
+        found = np.zeros((grid, 3))
+        np.add.at(found, (self.interval + 1) * STEPS, turn)
+        np.add.at(found, self.interval * STEPS, -turn)
+        return found
+
+
+@dataclass(slots=True)
+class Carrying:
+    """The gyro that carries the motion between knots.
+
+    Attributes
+    ----------
+    name : str
+        Of its factor.
+    known : ndarray of bool, shape (intervals,)
+        Intervals that the factor has rows for.
+    walk_rad : float
+        Noise of its turn over a grid step.
+    """
+
+    name: str
+    known: npt.NDArray[np.bool_]
+    walk_rad: float
+
+
+def noise_of(
+    rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array,
+    by: Carrying | None = None,
+) -> Noise:  # fmt: skip
+    """The sources of errors about a solution `x` of a problem that is linear about `path`; where no gyro carries it, none between knots."""
+    step = np.clip((clusters.time_ns[rows.cluster] - path.start_ns) // path.step_ns, 0, len(path.quat) - 2)
+    mats = frames.mat_from_quat(path.quat)
+    voxel = np.repeat(np.arange(len(rows.first) - 1), np.diff(rows.first))
+    inside = step[rows.first[:-1]]
+    place = np.einsum("nij,nj->ni", mats[inside], clusters.xyz_m[rows.cluster[rows.first[:-1]]])
+    carrier, others, anchors = None, [], []
+    for factor in factors:
+        whitened = sparse.diags(1.0 / factor.sigma) @ factor.matrix
+        if by is not None and factor.name == by.name:
+            interval = np.flatnonzero(by.known)
+            carrier = Carrier(factor, interval, mats[(interval + 1) * STEPS])
+        elif factor.name.endswith(("gyro", "accelerometer")):
+            others.append(whitened * lasting(factor.residual / factor.sigma + whitened @ x))
+        elif factor.name == "prior":  # that of the path is no knowledge, only a weak hold
+            anchors.append(whitened[6 * (rows.intervals + 3) :])
+        elif factor.name.startswith(ANCHORS):
+            anchors.append(whitened)
+        else:
+            others.append(whitened)
+    none = sparse.csr_matrix((0, len(x)))
+    return Noise(
+        rows, deflation, rows.residual_m + rows.along(x[: rows.size]), _patches(place + path.position_m[inside])[voxel], step,
+        np.einsum("nij,ni->nj", np.swapaxes(mats, 1, 2)[step], rows.jacobian[:, :3]), followed(path),
+        0.0 if by is None else by.walk_rad, carrier,
+        sparse.vstack([none, *others], format="csr"), sparse.vstack([none, *anchors], format="csr"),
+    )  # fmt: skip
+
+
+def _patches(place_m: Array) -> Ints:
+    """Number of the cube of `PATCH_M` that each place lies in, shape (n,)."""
+    cube = np.floor(place_m / PATCH_M).astype(np.int64)
+    return np.asarray(np.unique(cube, axis=0, return_inverse=True)[1]).ravel()
+
+
+def lasting(whitened: Array) -> float:
+    """Root of the power of residuals, three to a row, at low frequencies: 1 for white noise of the stated size, more where they last.
+
+    From sums over `LASTING_ROWS` rows on end; not below that of the rows by themselves.
+    """
+    rows = whitened.reshape(-1, 3)
+    power = float(np.mean(np.square(rows))) if len(rows) else 1.0
+    blocks = len(rows) // LASTING_ROWS
+    if blocks < 2:
+        return float(np.sqrt(power))
+    sums = rows[: blocks * LASTING_ROWS].reshape(blocks, LASTING_ROWS, 3).sum(axis=1) / np.sqrt(LASTING_ROWS)
+    return float(np.sqrt(max(power, np.mean(np.square(sums)))))
+
+
+def followed(path: Path) -> sparse.csr_matrix:
+    """From a course on the grid to the spline near it, on the grid again: its values at the knots, cubics kept."""
+    knots, grid = path.intervals + 1, len(path.quat)
+    pick = sparse.csr_matrix((np.ones(knots), (np.arange(knots), np.arange(knots) * STEPS)), shape=(knots, grid))
+    # straight beyond the ends, then the coefficients of a spline by their neighbours
+    ends = sparse.csr_matrix(
+        (
+            [3.0, -2.0, 2.0, -1.0, -1.0, 2.0, -2.0, 3.0],
+            (
+                [0, 0, 1, 1, knots + 2, knots + 2, knots + 3, knots + 3],
+                [0, 1, 0, 1, knots - 2, knots - 1, knots - 2, knots - 1],
+            ),
+        ),
+        shape=(knots + 4, knots),
+    )
+    wider = sparse.eye(knots + 4, knots, k=-2) + ends
+    coefficients = sparse.diags([-1.0 / 6.0, 8.0 / 6.0, -1.0 / 6.0], [0, 1, 2], shape=(knots + 2, knots + 4)) @ wider
+    step = np.arange(grid)
+    interval = np.minimum(step // STEPS, path.intervals - 1)
+    weights = np.array([basis(k / STEPS) for k in range(STEPS + 1)])[step - STEPS * interval]
+    values = sparse.csr_matrix(
+        (weights.ravel(), (np.repeat(np.arange(grid), 4), (interval[:, None] + np.arange(4)).ravel())),
+        shape=(grid, knots + 2),
+    )
+    return sparse.csr_matrix(values @ coefficients @ pick)

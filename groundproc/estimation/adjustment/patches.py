@@ -1,0 +1,164 @@
+"""What a window saw, small: its clusters of five seconds merged into patches of planes, for the joining of windows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from groundproc.estimation.adjustment.planes import Clusters, assign, placed, sorted_by
+from groundproc.estimation.adjustment.scans import SLICE_NS, STEPS
+from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.adjustment.track import even_shares
+from groundproc.numerics.rotations import flattest
+from groundproc.numerics.voxelhash import spread, voxel_key
+
+Array = npt.NDArray[np.float64]
+
+PATCH_M: Final = 1.0
+"""Edge of the voxels that patches are of."""
+CHUNK: Final = 50
+"""Slices that are merged: the correction of a path between windows changes by less than the noise in 5 s."""
+KEPT: Final = 1500
+"""Patches of a chunk, at most."""
+FEWEST: Final = 12
+"""Returns of a patch."""
+THICKEST_M: Final = 0.06
+"""Deviation from a plane beyond which a voxel makes no patch."""
+NARROWEST: Final = 0.12
+"""Its least width, one sigma, in voxels."""
+MOST: Final = 1_500_000
+"""Patches of a flight: those of an hour and a half; a longer one keeps fewer of each place."""
+
+
+@dataclass(slots=True)
+class Patches:
+    """Patches of planes, each seen within five seconds.
+
+    Attributes
+    ----------
+    clusters : Clusters
+        Mean time; mean place in the frame of the coarse path (`coarse`) at that time; scatter in the local frame; returns.
+    draw : ndarray of float32, shape (n,)
+        In [0, 1), the same for all patches of a place: those below a share are the places that are kept.
+    window : ndarray of int32, shape (n,)
+        Number of the window.
+    """
+
+    clusters: Clusters
+    draw: npt.NDArray[np.float32]
+    window: npt.NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.draw)
+
+    def of(self, which: npt.NDArray[Any]) -> "Patches":
+        """Some of them, by a mask or numbers."""
+        c = self.clusters
+        return Patches(
+            Clusters(c.time_ns[which], c.xyz_m[which], c.scatter_m2[which], c.count[which]), self.draw[which], self.window[which]
+        )  # fmt: skip
+
+
+def all_of(parts: Sequence[Patches], most: int = MOST) -> Patches:
+    """Patches of several windows as one, thinned to about `most` by their places."""
+    count = sum(len(part) for part in parts)
+    if count > most:
+        # the low bits of the draw: its high ones were used up when a chunk's patches were thinned
+        parts = [part.of(np.modf(part.draw * 4096.0)[0] < most / count) for part in parts]
+    clusters = [part.clusters for part in parts]
+    return Patches(
+        Clusters(
+            np.concatenate([c.time_ns for c in clusters]),
+            np.concatenate([c.xyz_m for c in clusters]),
+            np.concatenate([c.scatter_m2 for c in clusters]),
+            np.concatenate([c.count for c in clusters]),
+        ),
+        np.concatenate([part.draw for part in parts]),
+        np.concatenate([part.window for part in parts]),
+    )
+
+
+def coarse(path: Path) -> Path:
+    """The poses at slice boundaries; between them it is straight, and its matrices are no rotations exactly."""
+    return Path(path.start_ns, path.quat[::STEPS].copy(), path.position_m[::STEPS].copy(), SLICE_NS)
+
+
+def patches_of(gathered: Clusters, path: Path, window: int) -> Patches:
+    """Patches of a window's clusters where its path places them."""
+    world, _ = placed(gathered, path)
+    chunk = (gathered.time_ns - path.start_ns) // (SLICE_NS * CHUNK)
+    edges = np.searchsorted(chunk, np.arange(chunk[-1] + 2)) if len(chunk) else np.zeros(1, np.int64)
+    parts = [_merged(gathered, world, slice(int(first), int(last))) for first, last in pairwise(edges) if last > first]
+    none = np.zeros(0)
+    time_ns, place, scatter, count, draw = (
+        (np.concatenate([part[i] for part in parts]) for i in range(5)) if parts else (none, none.reshape(0, 3), none, none, none)
+    )  # fmt: skip
+    frame = coarse(path)
+    clusters = Clusters(
+        time_ns.astype(np.int64), np.zeros((len(draw), 3), np.float32), scatter.reshape(-1, 6).astype(np.float32),
+        count.astype(np.int32),
+    )  # fmt: skip
+    origin, mats = placed(clusters, frame)
+    inside = np.linalg.solve(mats.reshape(-1, 3, 3).astype(np.float64), (place - origin)[:, :, None])[:, :, 0]
+    clusters.xyz_m = inside.astype(np.float32)
+    return Patches(clusters, draw.astype(np.float32), np.full(len(draw), window, np.int32))
+
+
+def _merged(gathered: Clusters, world: Array, chunk: slice) -> tuple[npt.NDArray[Any], ...]:
+    """Time, place, scatter, returns and draw of the patches of a chunk."""
+    place = world[chunk]
+    voxel, voxels = assign(place, PATCH_M)
+    order, first = sorted_by(voxel, voxels)
+    time_ns, mean, scatter = np.empty(voxels, np.int64), np.empty((voxels, 3)), np.empty((voxels, 6))
+    count, kind, draw = np.empty(voxels), np.empty(voxels, np.int64), np.empty(voxels)
+    _merge(
+        first, order, gathered.time_ns[chunk], place, gathered.scatter_m2[chunk], gathered.count[chunk], time_ns, mean, scatter,
+        count, kind, draw,
+    )  # fmt: skip
+    shares = np.append(even_shares(np.bincount(kind[kind >= 0], minlength=2), KEPT), 0.0)
+    kept = draw < shares[kind]
+    return time_ns[kept], mean[kept], scatter[kept], count[kept], draw[kept]
+
+
+@njit(cache=True, nogil=True)
+def _merge(
+    first: Any, order: Any, time_ns: Any, world: Any, scatter: Any, counts: Any, out_time: Any, mean: Any, out_scatter: Any,
+    count: Any, kind: Any, draw: Any,
+) -> None:  # fmt: skip
+    """Sums of each voxel; `kind` is 0 for ground, 1 for other planes, -1 for what is none."""
+    normal = np.empty(3)
+    for v in range(len(first) - 1):
+        total, since = 0.0, 0.0
+        begin_ns = time_ns[order[first[v]]]
+        m, s = mean[v], out_scatter[v]
+        m[:], s[:] = 0.0, 0.0
+        for at in range(first[v], first[v + 1]):
+            n = order[at]
+            w = np.float64(counts[n])
+            total += w
+            since += w * (time_ns[n] - begin_ns)
+            for c in range(3):
+                m[c] += w * world[n, c]
+        m /= total
+        for at in range(first[v], first[v + 1]):
+            n = order[at]
+            w = np.float64(counts[n])
+            x, y, z = world[n, 0] - m[0], world[n, 1] - m[1], world[n, 2] - m[2]
+            s[0] += scatter[n, 0] + w * x * x
+            s[1] += scatter[n, 1] + w * x * y
+            s[2] += scatter[n, 2] + w * x * z
+            s[3] += scatter[n, 3] + w * y * y
+            s[4] += scatter[n, 4] + w * y * z
+            s[5] += scatter[n, 5] + w * z * z
+        out_time[v], count[v] = begin_ns + np.int64(since / total), total
+        draw[v] = (spread(voxel_key(m[0], m[1], m[2], 1.0 / PATCH_M) * 7919) & 0xFFFFF) / 1048576.0
+        kind[v] = -1
+        if total >= FEWEST:
+            part = 1.0 / total
+            low, middle = flattest(s[0] * part, s[1] * part, s[2] * part, s[3] * part, s[4] * part, s[5] * part, normal)
+            if low < THICKEST_M**2 and middle > (NARROWEST * PATCH_M) ** 2 and low < 0.15 * middle:
+                kind[v] = 0 if abs(normal[2]) > 0.9 else 1

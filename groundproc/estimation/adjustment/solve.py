@@ -1,0 +1,157 @@
+"""Gauss-Newton steps of the adjustment: conjugate gradients on the lidar's implicit normal matrix plus everybody else's sparse one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from groundproc.estimation.adjustment.coarse import Coarse, coarse_of
+from groundproc.estimation.adjustment.factors import Factor, Unknowns, normal_equations
+from groundproc.estimation.adjustment.planes import Rows
+from groundproc.estimation.adjustment.spline import Path
+
+Array = npt.NDArray[np.float64]
+
+SHARE: Final = 0.7
+"""Part of the lidar's information on fast motion that is left when the planes are unknowns too, roughly: it makes the preconditioner."""
+MOST_STEPS: Final = 80
+ENOUGH: Final = 0.01
+"""The iteration ends where what is missing is less than this in the cost: no function of the unknowns is then further than 0.1 of its own
+sigma from the exact solution (Cauchy and Schwarz, in the norm of the normal matrix)."""
+DELAY_STEPS: Final = 3
+"""What the last so many steps gained is what was missing before them, and more than is missing after (Strakos and Tichy 2002)."""
+
+
+class Factorisation(Protocol):
+    """What a sparse factorisation is used for here."""
+
+    def solve(self, right: Array) -> Array:
+        """The factored matrix's inverse times a vector."""
+
+
+@dataclass(slots=True)
+class Problem:
+    """The linear problem of one Gauss-Newton step.
+
+    Attributes
+    ----------
+    rows : Rows
+    deflation : float
+        What the lidar's information is divided by: neighbouring clusters share their errors.
+    normal : csc_matrix
+        Of everything else.
+    gradient : ndarray
+        Half the gradient of the whole cost.
+    factor : Factorisation
+        Of everything else and a share of the lidar's information with the planes fixed: the preconditioner's fine part.
+    coarse : Coarse
+        Its coarse part.
+    wide : Wide, optional
+        Rows that are in the gradient and not in `normal`.
+    """
+
+    rows: Rows
+    deflation: float
+    normal: sparse.csr_matrix
+    gradient: Array
+    factor: Factorisation
+    coarse: Coarse
+    wide: "Wide | None" = None
+
+    def apply(self, vector: Array) -> Array:
+        """The whole normal matrix times a vector."""
+        size = self.rows.size
+        out = self.normal @ vector
+        if self.wide is not None:
+            out += self.wide.rows.T @ (self.wide.rows @ vector)
+        out[:size] += self.rows.apply(vector[:size]) / self.deflation
+        return np.asarray(out)
+
+    def solve(self, right: Array, enough: float = ENOUGH, share: float = 0.0) -> tuple[Array, int]:
+        """Normal matrix x = right, by preconditioned conjugate gradients; and the steps it took.
+
+        Until less than `enough` is missing in the cost, or less than a `share` of the whole.
+        """
+        x, r = np.zeros_like(right), right.copy()
+        z = self.near(r)
+        p, rz = z.copy(), float(r @ z)
+        gains: list[float] = []
+        for step in range(1, MOST_STEPS + 1):
+            if rz <= 0.0:  # solved to the last digit
+                return x, step - 1
+            image = self.apply(p)
+            alpha = rz / float(p @ image)
+            x += alpha * p
+            r -= alpha * image
+            gains.append(alpha * rz)
+            if step >= DELAY_STEPS and sum(gains[-DELAY_STEPS:]) < max(enough, share * sum(gains)):
+                return x, step
+            z = self.near(r)
+            before, rz = rz, float(r @ z)
+            p = z + (rz / before) * p
+        return x, MOST_STEPS
+
+    def near(self, right: Array) -> Array:
+        """The preconditioner: nearly the inverse times a vector."""
+        found = self.factor.solve(right) + self.coarse.solve(right)
+        return np.asarray(found if self.wide is None else self.wide.bordered(found))
+
+
+def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation: float, path: Path) -> Problem:
+    """Set a step up, linear about a path."""
+    normal, gradient = normal_equations(factors)
+    gradient[: rows.size] += rows.gradient() / deflation
+    band = _sparse_band(rows.band() * (SHARE / deflation), unknowns.size)
+    if rows.lasers is not None:
+        band = band + _sparse_corner(rows.lasers.corner / deflation, rows.path_size, unknowns.size)
+    fine = splu(
+        (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
+    )
+    by_row = normal.tocsr()
+    found = Problem(rows, deflation, by_row, gradient, fine, coarse_of(rows, deflation, by_row, path))
+    wide = [sparse.diags(1.0 / each.sigma) @ each.matrix for each in factors if each.wide]
+    if wide:
+        found.wide = Wide(sparse.vstack(wide, format="csr"), found)
+    return found
+
+
+class Wide:
+    """Some rows that touch much of the path, added to a problem and to its preconditioner (Woodbury).
+
+    Parameters
+    ----------
+    rows : csr_matrix, shape (m, unknowns)
+        Of unit noise.
+    problem : Problem
+        Without them.
+    """
+
+    def __init__(self, rows: sparse.csr_matrix, problem: Problem) -> None:
+        dense = rows.toarray()
+        self.rows = rows
+        self._columns = np.stack([problem.near(row) for row in dense], axis=1)
+        self._small = np.linalg.inv(np.eye(len(dense)) + dense @ self._columns)
+
+    def bordered(self, found: Array) -> Array:
+        """What the preconditioner makes of a vector, of what it makes without these rows."""
+        return np.asarray(found - self._columns @ (self._small @ (self.rows @ found)))
+
+
+def _sparse_corner(corner: Array, start: int, size: int) -> sparse.csc_matrix:
+    """A square block at its place in the whole matrix."""
+    row, column = np.meshgrid(start + np.arange(len(corner)), start + np.arange(len(corner)), indexing="ij")
+    return sparse.csc_matrix((corner.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
+
+
+def _sparse_band(band: Array, size: int) -> sparse.csc_matrix:
+    """Blocks, shape (intervals, 4, 4, 6, 6), at the coefficients of each interval."""
+    intervals = len(band)
+    start = 6 * np.arange(intervals)
+    i, j, a, b = np.meshgrid(np.arange(4), np.arange(4), np.arange(6), np.arange(6), indexing="ij")
+    row = start[:, None] + (6 * i + a).ravel()
+    column = start[:, None] + (6 * j + b).ravel()
+    return sparse.csc_matrix((band.reshape(intervals, -1).ravel(), (row.ravel(), column.ravel())), shape=(size, size))

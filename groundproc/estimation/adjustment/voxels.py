@@ -1,0 +1,145 @@
+"""A map of planes: second moments of the returns in each voxel of a hash that grows."""
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from groundproc.numerics.rotations import flattest
+from groundproc.numerics.voxelhash import spread, voxel_key
+
+Array = npt.NDArray[np.float64]
+
+COUNT, MEAN, SCATTER, NORMAL, LEVEL, FLATNESS, TILT = 0, 1, 4, 10, 13, 14, 15
+"""Columns of a voxel: returns; their mean (3); scatter about it (6); normal (3); its distance from the origin; variance along it,
+negative where it is no plane; variance of the normal's direction."""
+COLUMNS: Final = 16
+LEAST_FLATNESS_M2: Final = 1e-4
+"""Returns of one ring share errors: a plane's deviation is taken to be 1 cm at least where its tilt is judged."""
+
+FEWEST: Final = 12
+"""Returns that make a plane."""
+FLATTEST_M: Final = 0.05
+"""Deviation from a plane beyond which a voxel is none, one sigma [m]."""
+NARROWEST: Final = 0.16
+"""Least width of the returns across the plane's narrow side, one sigma, in voxels: a single ring on the ground is no plane."""
+
+
+class PlaneMap:
+    """Voxels, found by their keys.
+
+    Parameters
+    ----------
+    voxel_m : float
+    """
+
+    def __init__(self, voxel_m: float) -> None:
+        self.voxel_m = voxel_m
+        self.table = np.full(1 << 17, -1, np.int32)
+        self.keys = np.empty(1 << 16, np.int64)
+        self.voxels = np.zeros((1 << 16, COLUMNS))
+        self.count = 0
+
+    def insert(self, world_m: Array, clusters: npt.NDArray[np.void], most: float) -> None:
+        """Add clusters whose means lie at `world_m`, shape (m, 3); a voxel forgets beyond `most` returns."""
+        if self.count + len(world_m) > len(self.keys) or 2 * (self.count + len(world_m)) > len(self.table):
+            self._grow()
+        self.count = _insert(
+            self.table, self.keys, self.voxels, self.count, world_m, clusters["scatter"], clusters["count"],
+            self.voxel_m, most,
+        )  # fmt: skip
+
+    def forget_beyond(self, centre_m: Array, distance_m: float) -> None:
+        """Drop what lies farther away than a distance: bounds the memory of a long flight."""
+        rows = self.voxels[: self.count]
+        kept = np.square(rows[:, MEAN : MEAN + 3] - centre_m).sum(axis=1) < distance_m**2
+        count = int(kept.sum())
+        self.keys[:count], self.voxels[:count] = self.keys[: self.count][kept], rows[kept]
+        self.count = count
+        self._index()
+
+    def _grow(self) -> None:
+        self.keys = np.concatenate([self.keys, np.empty_like(self.keys)])
+        self.voxels = np.concatenate([self.voxels, np.zeros_like(self.voxels)])
+        self.table = np.empty(2 * len(self.table), np.int32)
+        self._index()
+
+    def _index(self) -> None:
+        self.table[:] = -1
+        _index(self.table, self.keys, self.count)
+
+
+@njit(cache=True, nogil=True)
+def _index(table: Any, keys: Any, count: int) -> None:
+    mask = len(table) - 1
+    for row in range(count):
+        slot = spread(keys[row]) & mask
+        while table[slot] >= 0:
+            slot = (slot + 1) & mask
+        table[slot] = row
+
+
+@njit(cache=True, nogil=True, inline="always")
+def find(table: Any, keys: Any, key: Any) -> Any:
+    """Row of a voxel, -1 where there is none."""
+    mask = len(table) - 1
+    slot = spread(key) & mask
+    while table[slot] >= 0:
+        if keys[table[slot]] == key:
+            return table[slot]
+        slot = (slot + 1) & mask
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _insert(
+    table: Any, keys: Any, voxels: Any, count: int, world: Any, scatter: Any, counts: Any, voxel_m: float, most: float
+) -> int:
+    mask, per_m = len(table) - 1, 1.0 / voxel_m
+    normal = np.empty(3)
+    for n in range(len(world)):
+        key = voxel_key(world[n, 0], world[n, 1], world[n, 2], per_m)
+        slot = spread(key) & mask
+        while table[slot] >= 0 and keys[table[slot]] != key:
+            slot = (slot + 1) & mask
+        row = table[slot]
+        if row < 0:
+            row = count
+            table[slot], keys[row] = row, key
+            voxels[row] = 0.0
+            count += 1
+        v = voxels[row]
+        before = v[COUNT]
+        if before > most:
+            for c in range(SCATTER, SCATTER + 6):
+                v[c] *= most / before
+            before = most
+        added = np.float64(counts[n])
+        total = before + added
+        dx, dy, dz = world[n, 0] - v[MEAN], world[n, 1] - v[MEAN + 1], world[n, 2] - v[MEAN + 2]
+        share = added / total
+        weight = before * share
+        v[COUNT] = total
+        v[MEAN] += share * dx
+        v[MEAN + 1] += share * dy
+        v[MEAN + 2] += share * dz
+        v[SCATTER] += scatter[n, 0] + weight * dx * dx
+        v[SCATTER + 1] += scatter[n, 1] + weight * dx * dy
+        v[SCATTER + 2] += scatter[n, 2] + weight * dx * dz
+        v[SCATTER + 3] += scatter[n, 3] + weight * dy * dy
+        v[SCATTER + 4] += scatter[n, 4] + weight * dy * dz
+        v[SCATTER + 5] += scatter[n, 5] + weight * dz * dz
+        v[FLATNESS] = -1.0
+        if total >= FEWEST:
+            s = 1.0 / total
+            low, middle = flattest(
+                s * v[SCATTER], s * v[SCATTER + 1], s * v[SCATTER + 2], s * v[SCATTER + 3], s * v[SCATTER + 4],
+                s * v[SCATTER + 5], normal,
+            )  # fmt: skip
+            if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
+                v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
+                v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
+                v[FLATNESS] = max(low, 0.0)
+                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, 400.0) * middle)
+    return count

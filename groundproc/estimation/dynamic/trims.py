@@ -1,0 +1,130 @@
+"""Trims over time: splines between them, the second pass over the trajectory, and trims.csv."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from flightlog import frames
+from flightlog.constants import NS_PER_S
+from flightlog.errors import LogError
+from groundproc.estimation.dynamic.search import Found
+from groundproc.files import written_aside
+from groundproc.trajectory.table import from_poses
+from groundproc.trajectory.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+
+LONGEST_STEP_NS: Final = NS_PER_S
+"""Over a longer silence of the lidar no spline is laid: it would swing; a straight line takes its place."""
+COLUMNS: Final = (
+    "utc_ns", "heading_deg", "yaw_deg", "altitude_m", "pitch_deg", "roll_deg", "x_m", "y_m", "course_minus_heading_deg",
+    "ground_before_m", "ground_after_m", "plan_before_m", "plan_after_m", "pixels",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Trims:
+    """Trims of a flight, one row for each revolution.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+    heading_rad : ndarray, shape (n,)
+        As the compass had it.
+    values : ndarray, shape (n, 6)
+        In the order of search.VARIABLES, in all: that of a compass curve included.
+    course_rad : ndarray, shape (n,)
+        Course over ground less heading; nan where there is none.
+    found : sequence of Found
+        What the search says of each.
+    """
+
+    time_ns: Times
+    heading_rad: Array
+    values: Array
+    course_rad: Array
+    found: Sequence[Found]
+
+
+def interpolated(time_ns: Times, values: Array, asked_ns: Times, rate_hz: float) -> Array:
+    """Trims, shape (n, 6), at asked times, shape (m, 6), by a cubic spline on a grid of `rate_hz`; held beyond the first and the last."""
+    step_ns = max(1, round(NS_PER_S / rate_hz))
+    grid = np.arange(time_ns[0], time_ns[-1] + step_ns, step_ns, dtype=np.int64)
+    seconds, asked_s = (time_ns - time_ns[0]) * 1e-9, (grid - time_ns[0]) * 1e-9
+    on_grid = np.stack([np.interp(asked_s, seconds, column) for column in values.T], axis=1)
+    edges = [0, *(np.flatnonzero(np.diff(time_ns) > LONGEST_STEP_NS) + 1).tolist(), len(time_ns)]
+    for a, b in itertools.pairwise(edges):
+        inside = (asked_s >= seconds[a]) & (asked_s <= seconds[b - 1])
+        if b - a > 3 and inside.any():
+            on_grid[inside] = CubicSpline(seconds[a:b], values[a:b])(asked_s[inside])
+    at_s = (asked_ns - time_ns[0]) * 1e-9
+    return np.stack([np.interp(at_s, asked_s, column) for column in on_grid.T], axis=1)
+
+
+def applied(trajectory: Trajectory, values: Array) -> Trajectory:
+    """The trajectory with trims, shape (n, 6), at its knots: step 3 of the source's geometry."""
+    heading, pitch, roll = frames.attitude_of(frames.mat_from_quat(trajectory.quat_local_ins_wxyz))
+    turned = frames.mat_local_ins(heading + values[:, 0], pitch + values[:, 2], roll + values[:, 3])
+    position = trajectory.position_m + values[:, [4, 5, 1]]
+    made = from_poses(
+        trajectory.frame,
+        trajectory.time_ns,
+        position,
+        frames.quat_from_mat(turned),
+        trajectory.sigma_position_m,
+        trajectory.sigma_attitude_rad,
+    )
+    return replace(made, covered=made.covered & trajectory.covered, interpolation=trajectory.interpolation)
+
+
+def write_trims(path: Path, trims: Trims) -> None:
+    """Write trims.csv, angles in degrees."""
+    degrees = np.rad2deg(trims.values)
+    rows = np.column_stack(
+        [
+            np.rad2deg(trims.heading_rad) % 360.0,
+            degrees[:, 0],
+            trims.values[:, 1],
+            degrees[:, 2:4],
+            trims.values[:, 4:6],
+            np.rad2deg(trims.course_rad),
+            [[*each.ground_m, *each.plan_m] for each in trims.found],
+        ]
+    )
+    with written_aside(path) as aside, aside.open("w", encoding="ascii", newline="\n") as file:
+        file.write(",".join(COLUMNS) + "\n")
+        for stamp, row, each in zip(trims.time_ns.tolist(), rows.tolist(), trims.found, strict=True):
+            file.write(f"{stamp},{','.join(f'{value:.4f}' for value in row)},{each.pixels}\n")
+
+
+def read_yaw(path: Path) -> tuple[Times, Array, Array]:
+    """Times [ns], compass headings and yaw trims [rad] of a trims.csv, each of shape (n,).
+
+    Raises
+    ------
+    LogError
+        It cannot be read, or is not such a table.
+    """
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            names = file.readline().strip().split(",")
+            places = [names.index(name) for name in ("utc_ns", "heading_deg", "yaw_deg")]
+            rows = [line.strip().split(",") for line in file if line.strip()]
+        time_ns = np.array([int(row[places[0]]) for row in rows], np.int64)
+        angles = np.array([[float(row[place]) for place in places[1:]] for row in rows]).reshape(-1, 2)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, IndexError):
+        raise LogError(
+            f"{path}: is no table of trims; expected the columns {', '.join(COLUMNS[:3])} and numbers"
+        ) from None
+    if not np.isfinite(angles).all():
+        raise LogError(f"{path}: a heading or yaw trim is no finite number")
+    return time_ns, np.deg2rad(angles[:, 0]), np.deg2rad(angles[:, 1])

@@ -1,0 +1,198 @@
+"""Method `filtered`: strapdown navigation with the gyros and accelerometers of the autopilot and the lidar, smoothed over the whole flight.
+
+What it estimates and what it assumes stands in `groundproc.estimation.inertial`; docs/methods/filtered.md explains it.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from flightlog.errors import LogError
+from groundproc.estimation.inertial.model import (
+    ATTITUDE,
+    COMPASS,
+    COURSE,
+    FIX_AGE,
+    FORCE_BIAS,
+    GYRO_BIAS,
+    GYRO_MATRIX,
+    POSITION,
+)
+from groundproc.estimation.inertial.readings import read
+from groundproc.estimation.inertial.solution import Solution, solve
+from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.surveyed import surveyed
+from groundproc.flight.positions.fixes import OutsideFixes
+from groundproc.flight.timeline import Leg
+from groundproc.geodesy import LocalFrame
+from groundproc.trajectory.trajectory import Trajectory, joined
+
+Array = npt.NDArray[np.float64]
+
+SIGMA_SOURCE: Final = (
+    "covariance of the smoother; position: what the fixes state, their errors correlated over 60 s; noise of the autopilot's attitude "
+    "learnt from the flight"
+)
+CONVERGED_M: Final = 1.0
+CONVERGED_RAD: Final = np.deg2rad(1.0)
+
+
+def filtered_estimate(given: Given, progress: Progress, outside: Sequence[OutsideFixes] = ()) -> Estimate:
+    """Smooth each leg; a boot that never had a fix leaves a gap.
+
+    Parameters
+    ----------
+    given : Given
+    progress : Progress
+    outside : sequence of OutsideFixes
+        Positions or poses from elsewhere, in the local frame of `given`, beside those of the survey.
+
+    Raises
+    ------
+    LogError
+        No leg gives a trajectory, or the survey's positions cannot be read.
+    """
+    del progress
+    outside = [*outside, *surveyed(given)]
+    parts: list[Trajectory] = []
+    reports: list[dict[str, Any]] = []
+    reasons: list[LogError] = []
+    warnings: list[str] = []
+    placed = given.placed
+    for number, (leg, fix) in enumerate(zip(placed, given.fixes, strict=True)):
+        try:
+            solution = solve_leg(given, leg, fix, outside)
+        except LogError as error:
+            reasons.append(error)
+            continue
+        reports.append({"boot": leg.boot.number, "lidar_run": leg.run} | report(solution))
+        warnings += _warnings(solution)
+        part = trajectory_in(given.frame, solution)
+        # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
+        if number and placed[number - 1].boot is leg.boot and parts:
+            part = part.after(int(parts[-1].time_ns[-1]))
+        if number + 1 < len(placed) and placed[number + 1].boot is leg.boot:
+            part = part.before(int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]))
+        if len(part) > 1:
+            parts.append(part)
+    if reasons and not parts:
+        raise reasons[0]
+    return Estimate(joined(parts), given.mount, SIGMA_SOURCE, report={"legs": reports}, warning="; ".join(warnings))
+
+
+def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[OutsideFixes] = ()) -> Solution:
+    """The smoothed states of one leg, for those who want more than the trajectory.
+
+    Raises
+    ------
+    LogError
+        Position and attitude do not overlap.
+    """
+    run = given.flight.runs[leg.run]
+    lidar = None if run.gyro is None or run.force_m_s2 is None else (run.gyro, run.force_m_s2)
+    readings = read(
+        leg.boot,
+        fixes,
+        given.frame,
+        leg.utc_from_boot,
+        given.mount,
+        lidar=lidar,
+        utc_from_lidar=leg.utc_from_lidar,
+        mat_ins_lidar=leg.sync.mat_ins_lidar,
+        outside=outside,
+    )
+    return solve(readings)
+
+
+def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
+    """The trajectory of a solution, with its sigmas; `frame` is that of its readings."""
+    position, attitude = sigmas(solution)
+    kept_s = (solution.kept_ns - solution.time_ns[0]) * 1e-9
+    nodes_s = (solution.time_ns - solution.time_ns[0]) * 1e-9
+    return Trajectory(
+        frame=frame,
+        time_ns=solution.time_ns,
+        position_m=solution.position_m,
+        velocity_m_s=solution.velocity_m_s,
+        quat_local_ins_wxyz=solution.quat,
+        rate_rad_s=solution.rate_rad_s,
+        sigma_position_m=np.stack([np.interp(nodes_s, kept_s, axis) for axis in position.T], axis=1),
+        sigma_attitude_rad=np.stack([np.interp(nodes_s, kept_s, axis) for axis in attitude.T], axis=1),
+        covered=solution.covered,
+    )
+
+
+def sigmas(solution: Solution) -> tuple[Array, Array]:
+    """Sigma east, north, up [m] and of roll, pitch, heading [rad] at the kept times, shape (k, 3) each."""
+    covariance = solution.covariance
+    place = slice(POSITION, POSITION + 3)
+    position = np.sqrt(np.diagonal(covariance[:, place, place], axis1=1, axis2=2).astype(np.float64))
+    turn = slice(ATTITUDE, ATTITUDE + 3)
+    row = np.searchsorted(solution.time_ns, solution.kept_ns)
+    heading, pitch, _ = frames.attitude_of(frames.mat_from_quat(solution.quat[row]))
+    # a small turn in the local frame as changes of roll, pitch, heading
+    sine, cosine, tangent, secant = np.sin(heading), np.cos(heading), np.tan(pitch), 1.0 / np.cos(pitch)
+    zero, one = np.zeros_like(sine), np.ones_like(sine)
+    turned = np.stack(
+        [
+            np.stack([sine * secant, cosine * secant, zero], axis=1),
+            np.stack([cosine, -sine, zero], axis=1),
+            np.stack([sine * tangent, cosine * tangent, -one], axis=1),
+        ],
+        axis=1,
+    )
+    spread = turned @ covariance[:, turn, turn].astype(np.float64) @ np.swapaxes(turned, 1, 2)
+    return position, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+
+
+def report(solution: Solution) -> dict[str, Any]:
+    """What quality.json says of one leg."""
+    r, model = solution.readings, solution.model
+    middle = len(solution.kept_ns) // 2
+    state, sigma = solution.states[middle], np.sqrt(solution.variance[middle])
+
+    def stated(first: int, count: int, unit: float = 1.0) -> dict[str, list[float]]:
+        part = slice(first, first + count)
+        return {"value": (state[part] * unit).tolist(), "sigma": (sigma[part] * unit).tolist()}
+
+    degree = float(np.rad2deg(1.0))
+    found: dict[str, Any] = {
+        "gyros": None if r.gyro is None else r.gyro.sources,
+        "accelerometers": None if r.force is None else r.force.sources,
+        "iterations": solution.iterations,
+        "last_step_m": solution.last_step_m,
+        "last_step_deg": solution.last_step_rad * degree,
+        "gyro_bias_deg_s": stated(GYRO_BIAS, 3, degree),
+        "gyro_matrix": stated(GYRO_MATRIX, 9),
+        "accelerometer_bias_m_s2": stated(FORCE_BIAS, 3),
+        "fix_age_s": stated(FIX_AGE, 1),
+        "compass_deg": {"terms": ["1", "sin h", "cos h", "sin 2h", "cos 2h"]} | stated(COMPASS, 5, degree),
+        "tilt_error_deg": model.tilt_rad * degree,
+        "heading_error_deg": model.heading_rad * degree,
+        "standing_s": solution.stands_s,
+        "drives": solution.driving,
+        "fixes_dropped_without_gps": r.dropped_fixes,
+        "measurements": {
+            kind: {"rows": rows, "rms": solution.residual_rms[kind], "outliers": solution.outliers[kind]}
+            for kind, rows in solution.rows.items()
+        },
+    }
+    if solution.driving:
+        found["course_deg"] = stated(COURSE, 1, degree)
+    for name, signal in (("gyros", r.gyro), ("accelerometers", r.force)):
+        if signal is not None:
+            found[f"{name}_noise_per_sqrt_hz"] = float(np.sqrt(np.median(signal.density)))
+            found[f"{name}_share_of_autopilot"] = signal.share
+    return found
+
+
+def _warnings(solution: Solution) -> list[str]:
+    """What the self-check has against a solution."""
+    if solution.last_step_m <= CONVERGED_M and solution.last_step_rad <= CONVERGED_RAD:
+        return []
+    moving = f"{solution.last_step_m:.2f} m and {np.rad2deg(solution.last_step_rad):.2f} deg"
+    return [f"filtered: after {solution.iterations} iterations still moving by {moving}; expected to settle"]

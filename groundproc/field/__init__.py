@@ -1,0 +1,1 @@
+"""At the airfield: logs fetched from the aircraft, and played again."""

@@ -1,0 +1,134 @@
+"""What of a flight fits in memory: autopilot, lidar gyros, clocks; everything but the lidar's packets."""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import nmea, records
+from flightlog.errors import LogError
+from flightlog.logfile import LogReader
+from flightlog.mavlink import Frame, FrameParser
+from groundproc.flight import autopilot, load, timebase
+from groundproc.flight.autopilot import Boot
+from groundproc.flight.load import JUMP_NS, PositionSamples
+from groundproc.flight.sync import GyroTrack
+from groundproc.flight.timeline import LidarRun
+
+Progress = Callable[[int], None]
+
+
+@dataclass(slots=True)
+class Flight:
+    """A flight without its points.
+
+    Attributes
+    ----------
+    boots : list of Boot
+    runs : list of LidarRun
+    frames, bad_bytes, unknown : int
+        MAVLink: frames read, bytes that belong to none, frames of messages outside the dialect.
+    """
+
+    boots: list[Boot]
+    runs: list[LidarRun]
+    frames: int = 0
+    bad_bytes: int = 0
+    unknown: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | None = None) -> Flight:
+    """Read autopilot and lidar clock of one flight.
+
+    Raises
+    ------
+    LogError
+        No lidar packets, or no autopilot, in the logs.
+    """
+    parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers))
+    count, kept = 0, []
+    for frame in _frames(readers, link, parser, samples, progress):
+        count += 1
+        if frame.message_id in autopilot.WANTED:  # the rest would fill the memory of an hour
+            kept.append(frame)
+    if not count:
+        raise LogError(
+            f"{readers[0].path}: no MAVLink of the link {link!r} in the log; a trajectory needs an autopilot"
+        )
+    boots = autopilot.boots(kept)
+    runs = _runs(readers, samples.samples())
+    if not runs:
+        raise LogError(f"{readers[0].path}: no lidar packets in the log")
+    return Flight(boots, runs, count, parser.bad_bytes, parser.unknown)
+
+
+def _frames(
+    readers: Sequence[LogReader],
+    link: str,
+    parser: FrameParser,
+    samples: load.PositionCollector,
+    progress: Progress | None,
+) -> Iterator[Frame]:
+    """The frames of a link; position packets go to `samples`, so that the logs are read once for both."""
+    for reader in load.in_order(readers):
+        for message in reader.messages((records.POSITION.topic, records.MAVLINK.topic + link), progress):
+            if message.topic == records.POSITION.topic:
+                samples.feed(message)
+                continue
+            for time_ns, data in records.decode_raw(message.data):
+                yield from parser.feed(time_ns, data)
+    yield from parser.finish()
+
+
+def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarRun]:
+    """Cut at the jumps of the lidar's clock against receive times."""
+    device, receive = samples.device_time_ns, samples.receive_time_ns
+    has_positions = len(device) >= 2
+    if not has_positions:
+        device, receive = _batch_times(readers)
+    if len(device) < 2:
+        return []
+    cuts = np.flatnonzero(np.abs(np.diff(device - receive)) > JUMP_NS) + 1
+    edges = [0, *cuts.tolist(), len(device)]
+    runs = []
+    for a, b in itertools.pairwise(edges):
+        if b - a < 2:
+            continue
+        part = slice(a, b)
+        line = timebase.host_line(device[part], receive[part])
+        (gyro, force), fixes = (_imu(samples, part), _fixes(samples, part)) if has_positions else ((None, None), ())
+        runs.append(LidarRun(int(receive[a]), int(receive[b - 1]), line, gyro, fixes, force))
+    return runs
+
+
+def _batch_times(readers: Sequence[LogReader]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Lidar and receive time of the first packet of every batch: for logs without position packets."""
+    pairs = [
+        (int(b.device_time_ns[0]), int(b.receive_time_ns[0])) for b in load.lidar_batches(readers) if len(b.packets)
+    ]
+    table = np.array(pairs, np.int64).reshape(-1, 2)
+    return table[:, 0], table[:, 1]
+
+
+def _imu(samples: PositionSamples, part: slice) -> tuple[GyroTrack, npt.NDArray[np.float64]] | tuple[None, None]:
+    """Rates and specific force of the samples that are later than all before them."""
+    time_ns = samples.device_time_ns[part]
+    good = samples.has_imu[part].copy()
+    good[1:] &= time_ns[1:] > np.maximum.accumulate(time_ns)[:-1]
+    if good.sum() < 2 or np.ptp(samples.gyro_rad_s[part][good], axis=0).max() == 0.0:
+        return None, None
+    return GyroTrack("the lidar", time_ns[good], samples.gyro_rad_s[part][good]), samples.accel_m_s2[part][good]
+
+
+def _fixes(samples: PositionSamples, part: slice) -> tuple[tuple[int, nmea.Rmc], ...]:
+    first, last = samples.receive_time_ns[part][0], samples.receive_time_ns[part][-1]
+    found = []
+    for sentence in samples.sentences:
+        if first <= sentence.receive_time_ns <= last:
+            fix = nmea.parse_rmc(sentence.text)
+            if fix is not None:
+                found.append((sentence.device_time_ns, fix))
+    return tuple(found)

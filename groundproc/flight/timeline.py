@@ -1,0 +1,246 @@
+"""Every clock of a flight on one scale, UTC: which boot of the autopilot goes with which run of the lidar's clock, and how.
+
+A leg is one boot together with one run of the lidar's clock between two jumps of it. Within a run lidar time has one line to UTC; each
+boot is tied to the lidar by its own synchronisation. So the lidar, which is what must fit, never has a step within a run.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.constants import NS_PER_S
+from flightlog.errors import ClockError, SyncError
+from flightlog.nmea import Rmc
+from groundproc.flight import sync, timebase
+from groundproc.flight.autopilot import Boot
+from groundproc.flight.sync import GyroTrack, Sync
+from groundproc.flight.timebase import HostLine, UtcTie
+
+Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+
+LEAST_OVERLAP_NS: Final = 2 * NS_PER_S
+SEARCH_S: Final = 15.0
+"""Shifts tried about what receive times say; a radio delays by up to 2 s, two computers' clocks by more."""
+DRIFT_SPAN_NS: Final = 600 * NS_PER_S
+"""From here on the drift that receive times show is better than none: it smears the gyros' correlation, and is right to some 10 ppm."""
+
+
+@dataclass(frozen=True, slots=True)
+class LidarRun:
+    """A stretch of the lidar's clock without a jump.
+
+    Attributes
+    ----------
+    first_receive_ns, last_receive_ns : int
+        Receive times [log].
+    line : HostLine
+        Receive time over lidar time.
+    gyro : GyroTrack or None
+        None where the lidar sent no position packets, or no readings in them.
+    fixes : tuple of (int, Rmc)
+        Lidar time [ns] at which each GPS sentence first appeared.
+    force_m_s2 : ndarray, shape (n, 3), or None
+        Specific force in the sensor frame at the gyro's samples.
+    """
+
+    first_receive_ns: int
+    last_receive_ns: int
+    line: HostLine
+    gyro: GyroTrack | None
+    fixes: tuple[tuple[int, Rmc], ...]
+    force_m_s2: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A clock as a line over another: y = x + offset + drift (x - reference), all ns."""
+
+    offset_ns: int
+    drift: float = 0.0
+    reference_ns: int = 0
+
+    def __call__(self, x_ns: Times) -> Times:
+        """Times on the other clock, shape (n,)."""
+        if self.drift == 0.0:
+            return x_ns + self.offset_ns
+        return np.asarray(x_ns + self.offset_ns + np.rint((x_ns - self.reference_ns) * self.drift).astype(np.int64))
+
+    def inverse(self) -> "Line":
+        """The line back."""
+        return Line(-self.offset_ns, -self.drift / (1.0 + self.drift), self.reference_ns + self.offset_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One boot with one run of the lidar's clock.
+
+    Attributes
+    ----------
+    boot : Boot
+    run : int
+        Number of the lidar run.
+    sync : Sync
+    utc : UtcTie
+        What says which UTC it is.
+    lidar_line : tuple of Line
+        One after the other: from lidar time to UTC.
+    first_receive_ns, last_receive_ns : int
+        Receive times of the lidar run [log].
+    last_lidar_ns : int
+        Lidar time at its end.
+    """
+
+    boot: Boot
+    run: int
+    sync: Sync
+    utc: UtcTie
+    lidar_line: tuple[Line, ...]
+    first_receive_ns: int
+    last_receive_ns: int
+    last_lidar_ns: int
+
+    def utc_from_lidar(self, time_ns: Times) -> Times:
+        """UTC [ns] of lidar times, shape (n,)."""
+        for line in self.lidar_line:
+            time_ns = line(time_ns)
+        return time_ns
+
+    def utc_from_boot(self, time_ns: Times) -> Times:
+        """UTC [ns] of boot times, shape (n,)."""
+        return self.utc_from_lidar(_line(self.sync).inverse()(time_ns))
+
+
+def _line(found: Sync) -> Line:
+    return Line(found.offset_ns, found.drift_ppm * 1e-6, found.reference_ns)
+
+
+def legs(runs: Sequence[LidarRun], boots: Sequence[Boot], mat_ins_lidar: Array, how: str) -> list[Leg]:
+    """Pair runs and boots that overlap in receive time, synchronise each pair, and find UTC.
+
+    Parameters
+    ----------
+    runs, boots : sequences
+    mat_ins_lidar : ndarray, shape (3, 3)
+        The mount's rotation.
+    how : str
+        "gyro", "host", or "auto": gyros with receive times as the fallback.
+
+    Raises
+    ------
+    ClockError
+        No pair overlaps.
+    SyncError
+        `how` is "gyro" and the gyros do not tell.
+    """
+    found: list[Leg] = []
+    for number, run in enumerate(runs):
+        line: tuple[Line, ...] | None = None
+        tie = timebase.lidar_utc(run.fixes)
+        if tie is not None:
+            line = (Line(tie.offset_ns),)
+        for boot in boots:
+            boot_line = _overlap(run, boot)
+            if boot_line is None:
+                continue
+            match = _synchronise(run, boot, boot_line, mat_ins_lidar, how)
+            if line is None or tie is None:
+                tie = timebase.boot_utc(boot) or timebase.host_utc(boot_line, boot_line.reference_ns)
+                line = (_line(match), Line(tie.offset_ns))
+            last_lidar_ns = run.line.device_ns(run.last_receive_ns)
+            found.append(Leg(boot, number, match, tie, line, run.first_receive_ns, run.last_receive_ns, last_lidar_ns))
+    if not found:
+        raise ClockError(
+            "lidar and autopilot: their recordings do not overlap by 2 s in receive time; is it the same flight, and were the clocks "
+            "of both computers right?"
+        )
+    return found
+
+
+def _overlap(run: LidarRun, boot: Boot) -> HostLine | None:
+    """Receive time over boot time, None where the boot was not heard while the lidar ran."""
+    boot_ns, host_ns = boot.host_pairs()
+    if len(boot_ns) < 2:
+        return None
+    common = min(int(host_ns.max()), run.last_receive_ns) - max(int(host_ns.min()), run.first_receive_ns)
+    return timebase.host_line(boot_ns, host_ns) if common >= LEAST_OVERLAP_NS else None
+
+
+def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: Array, how: str) -> Sync:
+    host = _host_sync(run, boot_line)
+    if how == "host":
+        return host
+    try:
+        return _gyro_sync(run, boot, mat_ins_lidar, host)
+    except SyncError as error:
+        if how == "gyro":
+            raise
+        return replace(host, note=f"receive times only, because: {error}")
+
+
+def _host_sync(run: LidarRun, boot_line: HostLine) -> Sync:
+    """Both clocks through receive times: right to the difference of two unknown delays."""
+    middle = run.line.reference_ns
+    host_ns = run.line.host_ns(middle)
+    boot_ns = host_ns - boot_line.offset_ns
+    boot_ns -= round((boot_ns - boot_line.reference_ns) * boot_line.drift_ppm * 1e-6)
+    return Sync(
+        method="host",
+        offset_ns=boot_ns - middle,
+        sigma_offset_ns=float(np.hypot(run.line.sigma_ns, boot_line.sigma_ns)),
+        reference_ns=middle,
+        drift_ppm=run.line.drift_ppm - boot_line.drift_ppm,
+        sigma_drift_ppm=timebase.LARGEST_DRIFT * 1e6,
+        note="receive times only",
+    )
+
+
+def _gyro_sync(run: LidarRun, boot: Boot, mat_ins_lidar: Array, host: Sync) -> Sync:
+    """Gyro correlation with each of the boot's gyro series; the one whose stamps the trajectory uses is preferred.
+
+    Different messages are stamped at different points of the autopilot's loop: half of what they differ by goes into the sigma.
+    """
+    if run.gyro is None:
+        raise SyncError("lidar: no gyro readings in its position packets (UDP port 8308)")
+    tracks = boot.gyros()
+    if not tracks:
+        raise SyncError("MAVLink: no gyro rates (ATTITUDE, RAW_IMU) of the autopilot in the log")
+    results: list[Sync] = []
+    reasons: list[SyncError] = []
+    for track in tracks:
+        try:
+            results.append(_search(run.gyro, track, mat_ins_lidar, host))
+        except SyncError as error:
+            reasons.append(error)
+    if not results:
+        raise reasons[0]
+    sharpest = min(results, key=lambda result: result.sigma_offset_ns)
+    chosen = next(r for r in results if r.sigma_offset_ns <= 4.0 * sharpest.sigma_offset_ns)
+    apart = max(abs(r.offset_ns - chosen.offset_ns) for r in results)
+    apart = (
+        apart if apart < 20_000_000 else 0
+    )  # a series that is off by more is of another sensor, or has found another peak
+    return replace(chosen, sigma_offset_ns=float(np.hypot(chosen.sigma_offset_ns, 0.5 * apart)))
+
+
+def _search(gyro: GyroTrack, track: GyroTrack, mat_ins_lidar: Array, host: Sync) -> Sync:
+    """Near what receive times say, then anywhere: the two recordings may be from computers whose clocks differ."""
+    known = min(int(np.ptp(each.time_ns)) for each in (gyro, track)) >= DRIFT_SPAN_NS
+    match = partial(
+        sync.synchronise,
+        gyro,
+        track,
+        mat_ins_lidar=mat_ins_lidar,
+        expected_drift_ppm=host.drift_ppm if known else 0.0,
+    )
+    try:
+        return match(expected_ns=host.offset_ns, search_s=SEARCH_S)
+    except SyncError:
+        result = match()
+    apart_s = (result.offset_ns - host.offset_ns) / NS_PER_S
+    note = f"the two recordings' receive times differ by {apart_s:+.1f} s from what the gyros say"
+    return replace(result, note="; ".join(filter(None, (result.note, note))))

@@ -1,0 +1,1 @@
+"""Arrays in, arrays out: rotations, splines, robust statistics, hashes of voxels, planes. No file, clock, log or flight."""

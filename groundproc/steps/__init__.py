@@ -1,0 +1,1 @@
+"""The flight from logs to products."""

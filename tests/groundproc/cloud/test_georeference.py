@@ -1,0 +1,235 @@
+"""Points in the world against the source's row-vector equation, written out here with scipy, and against plain geometry."""
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from flightlog import hdl32e
+from flightlog.mount import LidarMount, Mount
+from groundproc.cloud.georeference import georeference, project
+from groundproc.cloud.points import Dropped
+from groundproc.geodesy import LocalFrame, Projection, projected_crs
+from groundproc.sensors import hdl32e as decode
+from groundproc.sensors.hdl32e import Gate
+from groundproc.trajectory.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+FRAME = LocalFrame(58.394, 15.574, 61.3)
+START_NS = 1_779_272_223_000_000_000
+
+
+def by_the_source(g: float, a: float, b: float) -> Array:
+    """R(g, a, b) of FOI-R--4045--SE, step 1, for row vectors: element by element as printed."""
+    cg, sg, ca, sa, cb, sb = np.cos(g), np.sin(g), np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    return np.array(
+        [
+            [cg * cb - sg * sa * sb, cb * sg + cg * sa * sb, -ca * sb],
+            [-ca * sg, cg * ca, sa],
+            [cg * sb + cb * sg * sa, sg * sb - cg * cb * sa, ca * cb],
+        ]
+    )
+
+
+def quat_wxyz(heading: float, pitch: float, roll: float) -> Array:
+    """Attitude as scipy composes it: turned left by minus the heading, then nose up, then right side down."""
+    x, y, z, w = Rotation.from_euler("ZXY", [-heading, pitch, roll]).as_quat()
+    return np.array([w, x, y, z])
+
+
+def at_rest(position: Array, quat: Array, start_ns: int = START_NS, seconds: int = 2) -> Trajectory:
+    """A trajectory that stays where it is."""
+    times = start_ns + np.arange(-1, seconds + 1, dtype=np.int64) * 1_000_000_000
+    many = len(times)
+    zero = np.zeros((many, 3))
+    covered = np.append(np.ones(many - 1, bool), False)
+    return Trajectory(
+        FRAME, times, np.tile(position, (many, 1)), zero, np.tile(quat, (many, 1)), zero, zero, zero, covered
+    )
+
+
+def turning(count: int, seed: int = 1, mode: int = 0x37) -> npt.NDArray[np.void]:
+    """Packets of a sensor that turns at 10 Hz, with random ranges, a tenth of them empty."""
+    rng = np.random.default_rng(seed)
+    content = b""
+    for packet in range(count):
+        for block in range(12):
+            firing = packet * 12 + block if mode != 0x39 else packet * 6 + block // 2
+            content += struct.pack("<HH", 0xEEFF, round(firing * 16.5888) % 36_000)
+            ranges = rng.integers(500, 50_000, 32) * (rng.random(32) > 0.1)
+            content += b"".join(
+                struct.pack("<HB", int(r), int(i)) for r, i in zip(ranges, rng.integers(0, 256, 32), strict=True)
+            )
+        content += struct.pack("<IBB", 0, mode, 0x21)
+    return np.frombuffer(content, hdl32e.DATA_DTYPE)
+
+
+ANGLE = st.floats(-np.pi, np.pi)
+TILT = st.floats(-1.4, 1.4)
+LENGTH = st.floats(-3.0, 3.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    mount=st.tuples(ANGLE, TILT, ANGLE),
+    lever=st.tuples(LENGTH, LENGTH, LENGTH),
+    attitude=st.tuples(st.floats(0.0, 2 * np.pi), TILT, ANGLE),
+    position=st.tuples(st.floats(-500, 500), st.floats(-500, 500), st.floats(-50, 200)),
+    mode=st.sampled_from([0x37, 0x39]),
+)
+def test_every_point_is_where_the_sources_equation_puts_it(
+    mount: tuple[float, ...],
+    lever: tuple[float, float, float],
+    attitude: tuple[float, ...],
+    position: tuple[float, ...],
+    mode: int,
+) -> None:
+    packets = turning(2, mode=mode)
+    times = START_NS + np.array([0, 552_960], np.int64)
+    yaw_deg, pitch_deg, roll_deg = np.rad2deg(mount)
+    bolted = Mount(LidarMount(lever, float(yaw_deg), float(pitch_deg), float(roll_deg)))
+    points = georeference(packets, times, at_rest(np.array(position), quat_wxyz(*attitude)), bolted)
+    shots = decode.decode(packets, times)
+    # step 2: p2 = p1 R(mount) + lever arm; step 3: p3 = p2 R(-heading, pitch, roll) + position
+    heading, pitch, roll = attitude
+    on_airframe = sensor_xyz(shots) @ by_the_source(*mount) + np.array(lever)
+    expected = on_airframe @ by_the_source(-heading, pitch, roll) + np.array(position)
+    np.testing.assert_allclose(points.xyz_m, expected, atol=1e-6)
+    assert (points.time_ns == shots.time_ns).all()
+    for name in ("range_steps", "intensity", "laser", "returns"):
+        assert (getattr(points, name) == getattr(shots, name)).all()
+
+
+def sensor_xyz(shots: decode.Shots) -> Array:
+    """Step 1 in float64, from what is whole in the shots: azimuth of the block by its time, range, laser."""
+    # each packet of `turning` begins a firing later: 16.5888 steps of 0.01 deg, rounded at the block, step 16 or 17 by the median
+    elevation = np.deg2rad(hdl32e.ELEVATION_DEG)[shots.laser]
+    across = np.arctan2(shots.xyz_m[:, 0].astype(np.float64), shots.xyz_m[:, 1].astype(np.float64))
+    # the azimuth is a multiple of 0.01 deg plus one of the step (a whole or half number) times the laser's fortieth
+    grid = 0.01 / 80.0
+    azimuth = np.rint(np.rad2deg(across) / grid) * grid
+    reach = shots.range_steps * 0.002
+    return np.stack(
+        [
+            reach * np.cos(elevation) * np.sin(np.deg2rad(azimuth)),
+            reach * np.cos(elevation) * np.cos(np.deg2rad(azimuth)),
+            reach * np.sin(elevation),
+        ],
+        axis=1,
+    )
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 180.0, 270.0, 33.0])
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0.0, 0.0), (12.0, 0.0), (0.0, -15.0), (-9.0, 20.0)])
+def test_level_ground_is_level_in_every_attitude(heading_deg: float, pitch_deg: float, roll_deg: float) -> None:
+    """Ranges to a plane 10 m below are computed by intersecting rays; a transposed matrix tilts it by 40 deg."""
+    airframe = Rotation.from_euler("ZXY", [-heading_deg, pitch_deg, roll_deg], degrees=True)
+    tilt = Rotation.from_euler("X", -20.0, degrees=True)
+    lidar_up_m = airframe.apply([0.0, 0.0, -0.16])[2]
+    azimuth = np.rint(np.arange(163 * 12) * 18.4).astype(int) % 36_000  # one turn
+    turned = np.deg2rad(azimuth[:, None] / 100 + 0.184 * np.arange(32) * 1.152 / 46.08)
+    up = np.deg2rad(hdl32e.ELEVATION_DEG)
+    rays = np.stack([np.cos(up) * np.sin(turned), np.cos(up) * np.cos(turned), np.sin(up) + 0 * turned], axis=-1)
+    down = airframe.apply(tilt.apply(rays.reshape(-1, 3)))[:, 2].reshape(-1, 32)
+    packets = np.zeros(163, hdl32e.DATA_DTYPE)
+    packets["return_mode"], packets["product"] = 0x37, 0x21
+    packets["blocks"]["azimuth"] = azimuth.reshape(163, 12)
+    reach_m = np.where(down < -0.15, -(10.0 + lidar_up_m) / np.minimum(down, -0.15), 0.0)
+    packets["blocks"]["returns"]["range"] = np.rint(reach_m / 0.002).reshape(163, 12, 32)
+    attitude = quat_wxyz(*np.deg2rad([heading_deg, pitch_deg, roll_deg]))
+    points = georeference(packets, np.full(163, START_NS), at_rest(np.array([3.0, 4.0, 110.0]), attitude), Mount())
+    assert len(points) > 10_000
+    # half a range step, and the difference between the median step (18 or 19) and 18.4 over a firing, under 67 m of range
+    np.testing.assert_allclose(points.xyz_m[:, 2], 100.0, atol=0.001 + np.deg2rad(0.006) * 67.0)
+    # forward is where the heading points: tilted forward, the lidar sees more ground ahead
+    ahead = (points.xyz_m[:, :2] - [3.0, 4.0]) @ [np.sin(np.deg2rad(heading_deg)), np.cos(np.deg2rad(heading_deg))]
+    assert ahead.mean() > 1.0 or pitch_deg > 0
+
+
+def test_each_firing_has_the_pose_of_its_own_middle() -> None:
+    """Spinning at 100 deg/s and flying at 10 m/s, against scipy's slerp at the middle of each firing."""
+    packets = turning(60)
+    times = START_NS + np.arange(60, dtype=np.int64) * 552_960
+    knots = START_NS + np.arange(-10, 10, dtype=np.int64) * 10_000_000
+    seconds = (knots - START_NS) * 1e-9
+    spin = np.deg2rad([3.0, -2.0, 100.0])
+    base = Rotation.from_euler("ZXY", [0.3, 0.1, -0.2])
+    turned = base * Rotation.from_rotvec(seconds[:, None] * spin)
+    speed = np.array([10.0, -4.0, 1.0])
+    quat = np.roll(turned.as_quat(), 1, axis=1)
+    many = (len(knots), 3)
+    trajectory = Trajectory(
+        FRAME, knots, seconds[:, None] * speed, np.tile(speed, (len(knots), 1)), quat, np.tile(spin, (len(knots), 1)),
+        np.zeros(many), np.zeros(many), np.append(np.ones(len(knots) - 1, bool), False),
+    )  # fmt: skip
+    points = georeference(packets, times, trajectory, Mount())
+    shots = decode.decode(packets, times)
+    firing = (shots.time_ns - START_NS) // 46_080
+    middle_s = (firing * 46_080 + 17_856) * 1e-9
+    tilt = Rotation.from_euler("X", -20.0, degrees=True)
+    on_airframe = tilt.apply(sensor_xyz(shots)) + np.array([0.0, 0.0, -0.16])
+    expected = (base * Rotation.from_rotvec(middle_s[:, None] * spin)).apply(on_airframe) + middle_s[:, None] * speed
+    np.testing.assert_allclose(points.xyz_m, expected, atol=2e-6)
+    # and that is what the docstring says of a pose of every shot's own instant: 50 deg/s at 50 m is 0.8 mm
+    own_s = (shots.time_ns - START_NS) * 1e-9
+    exact = (base * Rotation.from_rotvec(own_s[:, None] * spin)).apply(on_airframe) + own_s[:, None] * speed
+    limit = (
+        0.8e-3 * (np.linalg.norm(spin) / np.deg2rad(50)) * (shots.range_steps * 0.002 / 50)
+        + 17.9e-6 * np.linalg.norm(speed)
+        + 1e-5
+    )
+    assert (np.linalg.norm(points.xyz_m - exact, axis=1) <= limit).all()
+
+
+def test_what_makes_no_point_is_counted_by_its_first_reason() -> None:
+    packets = turning(400)
+    times = START_NS + np.arange(400, dtype=np.int64) * 552_960
+    whole = at_rest(np.zeros(3), np.array([1.0, 0, 0, 0]))
+    gate = Gate(255.0, 105.0, 5.0, 60.0)
+    points = georeference(packets, times, whole, Mount(), gate)
+    shots = decode.decode(packets, times, Gate(255.0, 105.0))
+    filled = packets.copy()
+    filled["blocks"]["returns"]["range"] = 1
+    lost = points.dropped
+    assert len(points) + lost.no_pose + lost.outside_fov + lost.no_return + lost.out_of_range == 400 * 384
+    assert len(points) == ((shots.range_steps >= 2500) & (shots.range_steps <= 30_000)).sum()
+    assert lost.out_of_range == len(shots) - len(points)
+    assert lost.no_return == len(decode.decode(filled, times, Gate(255.0, 105.0))) - len(shots)
+    assert lost.no_pose == 0
+    short = at_rest(np.zeros(3), np.array([1.0, 0, 0, 0]), START_NS - 2_000_000_000 + 100 * 552_960)
+    cut = georeference(packets, times, short, Mount(), gate)
+    # the end of the trajectory falls on the stamp of packet 100, before the middle of its first firing
+    assert cut.dropped.no_pose == 300 * 384
+    assert len(cut) == np.count_nonzero(points.time_ns < times[100])
+    assert Dropped(1, 2, 3, 4) + Dropped(10, 20, 30, 40) == Dropped(11, 22, 33, 44)
+
+
+def test_two_returns_of_a_pair_lie_on_one_line_from_the_lidar(data_payload: Callable[..., bytes]) -> None:
+    payload = bytearray(data_payload(0, [100 * (b // 2) for b in range(12)], mode=0x39))
+    for block in range(12):
+        for laser in range(32):
+            struct.pack_into("<HB", payload, 100 * block + 4 + 3 * laser, 3000 if block % 2 else 4500, laser)
+    packets = np.frombuffer(bytes(payload), hdl32e.DATA_DTYPE)
+    where = np.array([10.0, 20.0, 30.0])
+    quat = quat_wxyz(1.0, 0.2, -0.1)
+    points = georeference(packets, np.array([START_NS]), at_rest(where, quat), Mount())
+    assert points.returns.tolist() == [0x21, 0x22] * 192
+    lidar = where + Rotation.from_euler("ZXY", [-1.0, 0.2, -0.1]).apply([0.0, 0.0, -0.16])
+    near, far = points.xyz_m[::2] - lidar, points.xyz_m[1::2] - lidar
+    np.testing.assert_allclose(far, near * 1.5, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(near, axis=1), 6.0, atol=1e-9)
+
+
+def test_projecting_in_place_is_what_the_polynomial_says() -> None:
+    projection = Projection(FRAME, projected_crs(32633))
+    rng = np.random.default_rng(3)
+    local = rng.uniform([-150, -150, -10], [150, 150, 30], (5000, 3))
+    projected = local.copy()
+    project(projected, projection.polynomial(local.min(axis=0), local.max(axis=0)))
+    np.testing.assert_allclose(projected, projection.exact(local), atol=1e-4)

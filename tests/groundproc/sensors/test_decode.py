@@ -1,0 +1,245 @@
+"""Shots against velodyne-decoder on a recording, and against a plain loop written from the manual."""
+
+import itertools
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import velodyne_decoder
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flightlog import hdl32e, records
+from flightlog.errors import PacketError
+from groundproc.sensors.hdl32e import Gate, LaserTable, Shots, by_mode, decode
+
+# 63-9113 Rev A, page 10, retyped: elevation of each laser in firing order
+ELEVATIONS_DEG = [
+    -30.67, -9.33, -29.33, -8.00, -28.00, -6.67, -26.67, -5.33, -25.33, -4.00, -24.00, -2.67, -22.67, -1.33, -21.33, 0.00,
+    -20.00, 1.33, -18.67, 2.67, -17.33, 4.00, -16.00, 5.33, -14.67, 6.67, -13.33, 8.00, -12.00, 9.33, -10.67, 10.67,
+]  # fmt: skip
+
+
+def payloads(capture: Path) -> list[bytes]:
+    """UDP payloads of 1206 bytes of a classic little-endian pcap."""
+    content = capture.read_bytes()
+    found, at = [], 24
+    while at < len(content):
+        (size,) = struct.unpack_from("<I", content, at + 8)
+        if size == 1206 + 42:
+            found.append(content[at + 16 + 42 : at + 16 + size])
+        at += 16 + size
+    return found
+
+
+def by_hand(
+    payload: bytes, time_ns: int, gate: Gate
+) -> list[tuple[int, float, float, float, float, int, int, int, int]]:
+    """Time, x, y, z, azimuth [0.01 deg], range [2 mm], intensity, laser and returns of one packet: a loop over the bytes."""
+    dual = payload[1204] == 0x39
+    blocks = [payload[100 * b : 100 * b + 100] for b in range(12)]
+    azimuths = [struct.unpack_from("<H", block, 2)[0] for block in blocks][:: 2 if dual else 1]
+    steps = sorted((b - a + 18_000) % 36_000 - 18_000 for a, b in itertools.pairwise(azimuths))
+    step = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) / 2
+    width_deg = (gate.fov_end_deg - gate.fov_start_deg) % 360 or 360
+    found = []
+    for firing, azimuth in enumerate(azimuths):
+        pair = blocks[2 * firing : 2 * firing + 2] if dual else [blocks[firing]]
+        for laser in range(32):
+            here = azimuth % 36_000 + step * 1.152 * laser / 46.08
+            # the strongest before the last, for two of one range
+            echoes = [struct.unpack_from("<HB", block, 4 + 3 * laser) for block in reversed(pair)]
+            if dual and echoes[0] == echoes[1]:
+                echoes = echoes[:1]
+            near, far = gate.min_range_m - 1e-9, gate.max_range_m + 1e-9
+            echoes = sorted((e for e in echoes if e[0] > 0 and near <= e[0] * 0.002 <= far), key=lambda echo: echo[0])
+            if (here / 100 - gate.fov_start_deg) % 360 > width_deg:
+                continue
+            for number, (steps_2mm, intensity) in enumerate(echoes, 1):
+                elevation, turned, reach = (
+                    math.radians(ELEVATIONS_DEG[laser]),
+                    math.radians(here / 100),
+                    steps_2mm * 0.002,
+                )
+                found.append(
+                    (
+                        time_ns + 46_080 * firing + 1_152 * laser,
+                        reach * math.cos(elevation) * math.sin(turned),
+                        reach * math.cos(elevation) * math.cos(turned),
+                        reach * math.sin(elevation),
+                        here % 36_000,
+                        steps_2mm,
+                        intensity,
+                        laser,
+                        number + 16 * len(echoes),
+                    )
+                )
+    return found
+
+
+def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
+    """Whole numbers equal, coordinates to what float32 holds of them (131 m: 8 um)."""
+    assert len(shots) == len(expected)
+    if not expected:
+        return
+    time_ns, x, y, z, azimuth, ranges, intensity, laser, returns = (
+        np.array(column) for column in zip(*expected, strict=True)
+    )
+    assert (shots.time_ns == time_ns).all()
+    assert (shots.range_steps == ranges).all()
+    assert (shots.intensity == intensity).all()
+    assert (shots.laser == laser).all()
+    assert (shots.returns == returns).all()
+    np.testing.assert_allclose(shots.xyz_m, np.stack([x, y, z], axis=1), atol=1e-5)
+    off = (shots.azimuth_cdeg - azimuth + 18_000) % 36_000 - 18_000
+    assert np.abs(off).max() < 0.005  # float32 of up to 36000
+
+
+def packets_of(content: list[bytes]) -> npt.NDArray[np.void]:
+    return np.frombuffer(b"".join(content), hdl32e.DATA_DTYPE)
+
+
+@pytest.fixture(scope="module")
+def monterey(recordings: Path) -> list[bytes]:
+    return payloads(recordings / "lidar/hdl32e_monterey.pcap")
+
+
+def test_a_recording_decodes_as_velodyne_decoder_decodes_it(monterey: list[bytes]) -> None:
+    config = velodyne_decoder.Config(model=velodyne_decoder.Model.HDL32E, min_range=0.0, max_range=1000.0)
+    decoder = velodyne_decoder.StreamDecoder(config)
+    clouds = [cloud for i, payload in enumerate(monterey) if (cloud := decoder.decode(i * 553e-6, payload, True))]
+    rest = decoder.finish(True)
+    theirs = np.concatenate([cloud[1] for cloud in clouds] + ([rest[1]] if rest else []))
+    ours = decode(packets_of(monterey), np.arange(len(monterey), dtype=np.int64) * 553_000)
+    assert len(ours) == len(theirs) > 800_000
+    assert (ours.intensity == theirs["intensity"]).all()
+    assert (hdl32e.RING[ours.laser] == theirs["ring"]).all()
+    # their x is forward, their y left; their vertical offset leaves the horizontal distance alone
+    elevation = np.deg2rad(np.array(ELEVATIONS_DEG))[ours.laser]
+    their_steps = np.hypot(theirs["x"].astype(float), theirs["y"]) / np.cos(elevation) / 0.002
+    assert np.abs(their_steps - ours.range_steps).max() < 0.05  # float32
+    across = np.hypot(ours.xyz_m[:, 0] + theirs["y"], ours.xyz_m[:, 1] - theirs["x"])
+    assert across.mean() < 0.001
+    # they take the step over the packet from its ends, we its median: both know it to an encoder step of 0.01 deg
+    assert (across <= np.deg2rad(0.011) * ours.range_steps * 0.002).all()
+
+
+def test_a_recording_decodes_as_the_loop_by_hand_does(monterey: list[bytes]) -> None:
+    chosen = [p for p in monterey if any(struct.unpack_from("<H", p, 100 * b + 2)[0] == 36_000 for b in range(12))]
+    assert chosen, "the recording has an azimuth of 36000"
+    for payload in [*chosen, *monterey[::300]]:
+        for gate in (Gate(), Gate(255.0, 105.0, 1.0, 70.0)):
+            shots = decode(packets_of([payload]), np.array([7_000_000_000], np.int64), gate)
+            assert_same(shots, by_hand(payload, 7_000_000_000, gate))
+
+
+@st.composite
+def turning_packet(draw: st.DrawFn) -> bytes:
+    """A packet of a sensor that turns at 5 to 20 Hz, perhaps with a hole in its azimuths; few distinct ranges, so that pairs meet."""
+    dual = draw(st.booleans())
+    step = draw(st.floats(8.0, 34.0))
+    first = draw(st.one_of(st.integers(0, 36_000), st.sampled_from([10_480, 10_499, 25_490, 35_950, 35_999, 36_000])))
+    hole_at, hole = draw(st.integers(1, 11)), draw(st.sampled_from([0, 0, 4_000, 21_000]))
+    seed = draw(st.integers(0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
+    ranges = rng.choice([0, 0, 1, 499, 500, 501, 2_500, 30_000, 50_000, 50_001, 65_535], (12, 32))
+    intensities = rng.choice([0, 7, 255], (12, 32))
+    blocks = b""
+    for block in range(12):
+        firing = block // 2 if dual else block
+        azimuth = round(first + firing * step + (hole if firing >= hole_at else 0))
+        azimuth = azimuth if azimuth <= 36_000 else azimuth % 36_000
+        blocks += struct.pack("<HH", 0xEEFF, azimuth)
+        blocks += b"".join(struct.pack("<HB", *v) for v in zip(ranges[block], intensities[block], strict=True))
+    return blocks + struct.pack("<IBB", 123, 0x39 if dual else draw(st.sampled_from([0x37, 0x38])), 0x21)
+
+
+GATES = st.sampled_from([
+    Gate(), Gate(255.0, 105.0), Gate(105.0, 255.0), Gate(-105.0, 105.0, 1.0, 100.0), Gate(0.0, 360.0, 1.0, 100.0),
+    Gate(359.9, 0.1), Gate(12.0, 12.5, 0.5, 60.0), Gate(90.0, 90.0),
+])  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(payload=turning_packet(), gate=GATES)
+def test_any_packet_decodes_as_the_loop_by_hand_does(payload: bytes, gate: Gate) -> None:
+    shots = decode(packets_of([payload]), np.array([-5], np.int64), gate)
+    expected = by_hand(payload, -5, gate)
+    near_edge = any(
+        min((row[4] / 100 - edge) % 360, (edge - row[4] / 100) % 360) < 1e-7
+        for row in by_hand(payload, -5, Gate(0, 360, gate.min_range_m, gate.max_range_m))
+        for edge in (gate.fov_start_deg, gate.fov_end_deg)
+    )
+    if near_edge and len(shots) != len(expected):  # exactly on the edge: the last bit of a float decides
+        return
+    assert_same(shots, expected)
+
+
+@settings(max_examples=100, deadline=None)
+@given(noise=st.binary(min_size=1200, max_size=1200), mode=st.sampled_from([0x37, 0x39]))
+def test_packets_of_noise_give_shots_of_finite_place(noise: bytes, mode: int) -> None:
+    shots = decode(packets_of([noise + struct.pack("<IBB", 0, mode, 0x21)]), np.zeros(1, np.int64))
+    np.testing.assert_allclose(np.linalg.norm(shots.xyz_m.astype(float), axis=1), shots.range_steps * 0.002, rtol=1e-5)
+    assert ((shots.azimuth_cdeg >= 0) & (shots.azimuth_cdeg <= 36_000)).all()
+    assert (shots.range_steps > 0).all()
+
+
+def test_an_equal_pair_is_one_return_and_the_nearer_is_return_one(data_payload: Callable[..., bytes]) -> None:
+    payload = bytearray(data_payload(0, [100 * (b // 2) for b in range(12)], mode=0x39))
+    struct.pack_into("<HB", payload, 4, 3000, 11)  # laser 0: last at 6 m, strongest at 5 m
+    struct.pack_into("<HB", payload, 4 + 3, 2000, 12)  # laser 1: last at 4 m, before the strongest at 5 m
+    struct.pack_into("<HB", payload, 4 + 6, 2500, 13)  # laser 2: the same range, another strength
+    struct.pack_into("<HB", payload, 4 + 9, 0, 14)  # laser 3: no last return
+    shots = decode(packets_of([bytes(payload)]), np.zeros(1, np.int64))
+    first = shots.time_ns < 46_080
+    rows = list(
+        zip(
+            shots.laser[first].tolist(),
+            (shots.range_steps[first] * 2).tolist(),
+            shots.returns[first].tolist(),
+            strict=True,
+        )
+    )
+    assert rows[:7] == [
+        (0, 5000, 0x21), (0, 6000, 0x22), (1, 4000, 0x21), (1, 5000, 0x22), (2, 5000, 0x21), (2, 5000, 0x22), (3, 5000, 0x11),
+    ]  # fmt: skip
+    assert set(rows[7:]) == {(k, 5000, 0x11) for k in range(4, 32)}
+
+
+def test_a_batch_is_cut_where_the_return_mode_changes(data_payload: Callable[..., bytes]) -> None:
+    modes = [0x37, 0x37, 0x39, 0x39, 0x39, 0x38]
+    packets = np.zeros(len(modes), records.SCAN_PACKET_DTYPE)
+    packets["data"] = packets_of([data_payload(0, [0] * 12, mode=mode) for mode in modes])
+    parts = list(by_mode(packets, np.arange(6, dtype=np.int64)))
+    assert [times.tolist() for _, times in parts] == [[0, 1], [2, 3, 4], [5]]
+    assert [len(decode(p, t)) for p, t in parts] == [2 * 384, 3 * 192, 384]
+    with pytest.raises(PacketError, match="single and dual return mode"):
+        decode(packets, np.arange(6, dtype=np.int64))
+
+
+def test_packets_of_a_log_and_bare_packets_give_the_same(data_payload: Callable[..., bytes]) -> None:
+    content = [data_payload(0, [int(i * 1000 + 16.6 * b) for b in range(12)]) for i in range(5)]
+    logged = np.zeros(5, records.SCAN_PACKET_DTYPE)
+    logged["data"] = packets_of(content)
+    times = np.arange(5, dtype=np.int64)
+    ours, bare = decode(logged, times), decode(packets_of(content), times)
+    assert (ours.xyz_m == bare.xyz_m).all()
+    assert len(decode(logged[:0], times[:0])) == 0
+
+
+def test_corrections_of_a_laser_move_its_points_along_the_beam(data_payload: Callable[..., bytes]) -> None:
+    packet = packets_of([data_payload(0, list(range(0, 192, 16)))])
+    nominal = LaserTable.nominal()
+    offset = np.zeros(32)
+    offset[5] = 0.25
+    plain, moved = (
+        decode(packet, np.zeros(1, np.int64), lasers=t) for t in (nominal, LaserTable(nominal.elevation_rad, offset))
+    )
+    length = np.linalg.norm(moved.xyz_m, axis=1) - np.linalg.norm(plain.xyz_m, axis=1)
+    np.testing.assert_allclose(length, np.where(plain.laser == 5, 0.25, 0.0), atol=1e-5)
+    assert (moved.range_steps == plain.range_steps).all()
