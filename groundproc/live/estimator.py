@@ -12,10 +12,11 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.estimation import ins
-from groundproc.estimation.adjustment.motion import INS_FORCES, LEAST_BASE_HZ, Motion
-from groundproc.estimation.adjustment.scans import SLICE_NS, Slice
-from groundproc.estimation.adjustment.spline import Path
-from groundproc.estimation.adjustment.track import (
+from groundproc.estimation.odometry.grid import SLICE_NS
+from groundproc.estimation.odometry.motion import INS_FORCES, LEAST_BASE_HZ, Motion
+from groundproc.estimation.odometry.slices import Slice
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.track import (
     ATTITUDE_EVERY_NS,
     ATTITUDE_FIX_RAD,
     FIX_TAU_S,

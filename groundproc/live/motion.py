@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.adjustment.motion import CUBIC_BELOW_HZ, ImuTrack, on_grid
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import CUBIC_BELOW_HZ, ImuTrack, on_grid
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]

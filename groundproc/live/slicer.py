@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.adjustment.scans import SLICE_NS
+from groundproc.estimation.odometry.grid import SLICE_NS
 from groundproc.sensors import hdl32e as decode
 from groundproc.sensors.hdl32e import Gate
 

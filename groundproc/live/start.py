@@ -6,8 +6,8 @@ import numpy.typing as npt
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.estimation import ins
-from groundproc.estimation.adjustment.scans import STEP_NS
-from groundproc.estimation.adjustment.spline import integrated
+from groundproc.estimation.odometry.grid import STEP_NS
+from groundproc.estimation.odometry.spline import integrated
 from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
 from groundproc.live.clocks import Tie

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.estimation.adjustment.scans import STEP_NS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.grid import STEP_NS
+from groundproc.estimation.odometry.spline import Path
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.voxelhash import spread, voxel_key
 

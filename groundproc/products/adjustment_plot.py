@@ -13,11 +13,11 @@ from matplotlib.transforms import Bbox
 
 from flightlog import frames
 from groundproc.estimation.adjustment.adjusted import CausalRun, Run, attitude_track, position_track
-from groundproc.estimation.adjustment.anchors import Attitudes, Positions
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path as SensorPath
-from groundproc.estimation.adjustment.track import boundaries_ns
 from groundproc.estimation.method import Given
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path as SensorPath
+from groundproc.estimation.odometry.stated import Attitudes, Positions
+from groundproc.estimation.odometry.track import boundaries_ns
 from groundproc.files import written_aside
 from groundproc.trajectory.trajectory import Trajectory
 

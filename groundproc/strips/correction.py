@@ -8,7 +8,7 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog import frames
-from groundproc.estimation.adjustment.spline import basis
+from groundproc.estimation.odometry.spline import basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -6,9 +6,9 @@ from scipy import sparse
 
 from flightlog import frames
 from groundproc.estimation.adjustment.factors import Factor, Unknowns, prior_factor
-from groundproc.estimation.adjustment.planes import Clusters
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 70

@@ -17,18 +17,13 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.estimation import ins
-from groundproc.estimation.adjustment.anchors import Attitudes, Positions, within
+from groundproc.estimation.adjustment.anchors import within
 from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
-from groundproc.estimation.adjustment.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.adjustment.control import control_report, control_warnings
 from groundproc.estimation.adjustment.factors import H
 from groundproc.estimation.adjustment.joining import Joined, joining
 from groundproc.estimation.adjustment.lasers import Corrections
-from groundproc.estimation.adjustment.motion import ImuTrack, Motion, base_motion, on_grid
 from groundproc.estimation.adjustment.outside import DELAY, outside_track
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS, Slice, slices
-from groundproc.estimation.adjustment.spline import Path
-from groundproc.estimation.adjustment.track import Track, Tracker, grid_ns, tracked
 from groundproc.estimation.adjustment.windows import (
     OVERLAP,
     UNSEEN,
@@ -43,6 +38,13 @@ from groundproc.estimation.adjustment.windows import (
     whole_stiffness,
 )
 from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import ImuTrack, Motion, base_motion, on_grid
+from groundproc.estimation.odometry.slices import Slice, slices
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Attitudes, Positions
+from groundproc.estimation.odometry.track import Track, Tracker, grid_ns, tracked
 from groundproc.estimation.surveyed import surveyed, surveyed_control
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg

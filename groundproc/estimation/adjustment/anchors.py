@@ -9,60 +9,15 @@ import numpy.typing as npt
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.adjustment.factors import Factor, RowBuilder, Unknowns, cross, eye, whitened
-from groundproc.estimation.adjustment.scans import STEPS
-from groundproc.estimation.adjustment.spline import Path, basis
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.stated import Attitudes, Positions
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 COMPASS_TERMS: Final = 5
 """Constant, sine and cosine of the heading, sine and cosine of twice the heading."""
-
-
-@dataclass(slots=True)
-class Positions:
-    """Positions in the local frame.
-
-    Attributes
-    ----------
-    time_ns : ndarray of int64, shape (n,)
-        UTC.
-    position_m, sigma_m : ndarray, shape (n, 3)
-    lever_m : ndarray, shape (3,)
-        From the sensor to the point that they are of, sensor frame.
-    tau_s : ndarray, shape (3,)
-        How long their errors last.
-    white_m : float
-        The part of them that is new in each second.
-    """
-
-    time_ns: Ints
-    position_m: Array
-    sigma_m: Array
-    lever_m: Array
-    tau_s: Array
-    white_m: float
-
-
-@dataclass(slots=True)
-class Attitudes:
-    """Attitudes of the ins frame.
-
-    Attributes
-    ----------
-    time_ns : ndarray of int64, shape (n,)
-        UTC.
-    quat : ndarray, shape (n, 4)
-        Local from ins.
-    sigma_rad : ndarray, shape (3,)
-        About east, north, up.
-    tau_s : float
-    """
-
-    time_ns: Ints
-    quat: Array
-    sigma_rad: Array
-    tau_s: float
 
 
 @dataclass(slots=True)

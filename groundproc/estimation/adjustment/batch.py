@@ -11,8 +11,6 @@ from flightlog import frames
 from groundproc.estimation.adjustment import lasers
 from groundproc.estimation.adjustment.anchors import (
     COMPASS_TERMS,
-    Attitudes,
-    Positions,
     Tie,
     attitude_factor,
     fixes_name,
@@ -30,13 +28,15 @@ from groundproc.estimation.adjustment.factors import (
     robust_sigma,
     turn_factor,
 )
-from groundproc.estimation.adjustment.motion import ImuTrack, on_grid
 from groundproc.estimation.adjustment.noise import Carrying, Noise, noise_of
 from groundproc.estimation.adjustment.outside import DELAY, Outside, laid_by_pieces, outside_factors
-from groundproc.estimation.adjustment.planes import Clusters, rows_of
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.adjustment.planes import rows_of
 from groundproc.estimation.adjustment.solve import Problem, problem
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import ImuTrack, on_grid
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Attitudes, Positions
 from groundproc.flight.control import ControlPoint
 
 Array = npt.NDArray[np.float64]

@@ -18,8 +18,8 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from flightlog import frames
 from groundproc.estimation.adjustment.planes import Rows
-from groundproc.estimation.adjustment.scans import STEPS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
 

@@ -16,9 +16,10 @@ import numpy.typing as npt
 from groundproc.estimation.adjustment.anchors import spots as moments_of
 from groundproc.estimation.adjustment.datum import WIDEST_M, Datum, Spots, find_datum, reach_m
 from groundproc.estimation.adjustment.factors import Factor, RowBuilder, Unknowns, cross
-from groundproc.estimation.adjustment.planes import Clusters, placed
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.adjustment.planes import placed
 from groundproc.estimation.adjustment.surfaces import RADII_M, Near, Surface, near, surfaces
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.spline import Path
 from groundproc.flight.control import ControlPoint
 
 Array = npt.NDArray[np.float64]

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from flightlog import frames
-from groundproc.estimation.adjustment.odometry import GROUND
 from groundproc.estimation.adjustment.surfaces import ALIKE, Near, Surface, surfaces
+from groundproc.estimation.odometry.odometry import GROUND
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

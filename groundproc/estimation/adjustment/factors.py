@@ -14,8 +14,8 @@ from scipy import sparse
 
 from flightlog import frames
 from flightlog.constants import STANDARD_GRAVITY_M_S2
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path, integrated
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path, integrated
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

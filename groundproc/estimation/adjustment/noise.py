@@ -16,9 +16,10 @@ from scipy import sparse
 
 from flightlog import frames
 from groundproc.estimation.adjustment.factors import Factor
-from groundproc.estimation.adjustment.planes import Clusters, Rows
-from groundproc.estimation.adjustment.scans import STEPS
-from groundproc.estimation.adjustment.spline import Path, basis
+from groundproc.estimation.adjustment.planes import Rows
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.spline import Path, basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

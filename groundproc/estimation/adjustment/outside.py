@@ -16,8 +16,8 @@ from scipy import sparse
 from flightlog import frames
 from groundproc.estimation.adjustment.anchors import means, poses, seconds, spots, within
 from groundproc.estimation.adjustment.factors import Factor, RowBuilder, Unknowns, cross, eye
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.positions.solution import Quality
 from groundproc.flight.timebase import UtcTie

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.estimation.adjustment.planes import Clusters, assign, placed, sorted_by
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
-from groundproc.estimation.adjustment.track import even_shares
+from groundproc.estimation.adjustment.planes import assign, placed, sorted_by
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.track import even_shares
 from groundproc.numerics.rotations import flattest
 from groundproc.numerics.voxelhash import spread, voxel_key
 

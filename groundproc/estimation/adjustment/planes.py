@@ -14,9 +14,10 @@ from numba import njit, prange
 from scipy.ndimage import uniform_filter1d
 
 from groundproc.estimation.adjustment.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
-from groundproc.estimation.adjustment.odometry import GROUND, observable
-from groundproc.estimation.adjustment.scans import STEPS
-from groundproc.estimation.adjustment.spline import Path, basis
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.odometry import GROUND, observable
+from groundproc.estimation.odometry.spline import Path, basis
 from groundproc.numerics.rotations import flattest, mat_of_quat
 from groundproc.numerics.voxelhash import spread, voxel_key
 
@@ -39,30 +40,6 @@ SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
 """What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
 PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
-
-
-@dataclass(slots=True)
-class Clusters:
-    """Clusters of all slices: columns of scans.CLUSTER_DTYPE.
-
-    Attributes
-    ----------
-    time_ns : ndarray of int64, shape (n,)
-    xyz_m : ndarray of float32, shape (n, 3)
-    scatter_m2 : ndarray of float32, shape (n, 6)
-    count : ndarray of int32, shape (n,)
-    laser : ndarray of int32, shape (n,), optional
-        Given where the corrections of the single lasers are unknowns too.
-    """
-
-    time_ns: Ints
-    xyz_m: npt.NDArray[np.float32]
-    scatter_m2: npt.NDArray[np.float32]
-    count: npt.NDArray[np.int32]
-    laser: npt.NDArray[np.int32] | None = None
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 from groundproc.estimation.adjustment.coarse import Coarse, coarse_of
 from groundproc.estimation.adjustment.factors import Factor, Unknowns, normal_equations
 from groundproc.estimation.adjustment.planes import Rows
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
 

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from groundproc.estimation.adjustment.odometry import GROUND
-from groundproc.estimation.adjustment.planes import HUBER, RANGE_SIGMA_M, ROUGHNESS_M, Clusters, placed
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.adjustment.planes import HUBER, RANGE_SIGMA_M, ROUGHNESS_M, placed
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.odometry import GROUND
+from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

@@ -14,18 +14,19 @@ from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from groundproc.estimation.adjustment import lasers
-from groundproc.estimation.adjustment.anchors import Attitudes, Positions, Tie
+from groundproc.estimation.adjustment.anchors import Tie
 from groundproc.estimation.adjustment.batch import DRAWS, Batch, Posterior, Spread, joined, make_unit
 from groundproc.estimation.adjustment.control import kept_for, together
 from groundproc.estimation.adjustment.factors import H, Unknowns
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
-from groundproc.estimation.adjustment.motion import ImuTrack, Motion
 from groundproc.estimation.adjustment.outside import DELAY, Outside
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
-from groundproc.estimation.adjustment.planes import Clusters
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
-from groundproc.estimation.adjustment.track import Track
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
+from groundproc.estimation.odometry.motion import ImuTrack, Motion
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Attitudes, Positions
+from groundproc.estimation.odometry.track import Track
 from groundproc.flight.control import ControlPoint
 
 Array = npt.NDArray[np.float64]

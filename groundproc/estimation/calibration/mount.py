@@ -18,9 +18,9 @@ from flightlog.mount import Mount
 from groundproc.estimation.adjustment import lasers
 from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, PRIORS, joined, turned
 from groundproc.estimation.adjustment.lasers import Corrections
-from groundproc.estimation.adjustment.scans import STEPS
 from groundproc.estimation.adjustment.windows import UNSEEN, Window, corrections_over
 from groundproc.estimation.calibration.compass import BINS, CompassCurve, curve_of_errors, sector_of
+from groundproc.estimation.odometry.grid import STEPS
 
 Array = npt.NDArray[np.float64]
 

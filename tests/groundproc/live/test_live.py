@@ -20,9 +20,9 @@ import pytest
 from flightlog import records
 from flightlog.errors import LogError, SourceError, UsageError
 from flightlog.logfile import LogReader
-from groundproc.estimation.adjustment.motion import on_grid
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS
-from groundproc.estimation.adjustment.spline import Path as SensorPath
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS
+from groundproc.estimation.odometry.motion import on_grid
+from groundproc.estimation.odometry.spline import Path as SensorPath
 from groundproc.flight.sync import Sync
 from groundproc.live.clocks import Tie
 from groundproc.live.following import Follower

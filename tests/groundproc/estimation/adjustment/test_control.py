@@ -14,11 +14,11 @@ from groundproc.estimation.adjustment.batch import Posterior, turned, whole_cova
 from groundproc.estimation.adjustment.control import GATE_M, Held, control_report, control_warnings, held_to, spots_of
 from groundproc.estimation.adjustment.datum import Datum, Placing, find_datum
 from groundproc.estimation.adjustment.factors import Unknowns
-from groundproc.estimation.adjustment.planes import Clusters
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.adjustment.solve import Wide
-from groundproc.estimation.adjustment.spline import Path
 from groundproc.estimation.adjustment.surfaces import Surface, near, surfaces
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
 from groundproc.flight.control import ControlPoint
 
 Array = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from flightlog import frames
 from groundproc.estimation.adjustment import anchors
-from groundproc.estimation.adjustment.anchors import Attitudes, Positions, Tie
+from groundproc.estimation.adjustment.anchors import Tie
 from groundproc.estimation.adjustment.batch import make_unit, place_on_grid, turned
 from groundproc.estimation.adjustment.factors import (
     GRAVITY,
@@ -27,9 +27,10 @@ from groundproc.estimation.adjustment.factors import (
     turn_factor,
     whitened,
 )
-from groundproc.estimation.adjustment.motion import ImuTrack
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import ImuTrack
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Attitudes, Positions
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 12

@@ -10,7 +10,6 @@ import pytest
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.adjustment import adjusted
-from groundproc.estimation.adjustment.anchors import Attitudes, Positions
 from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, turned
 from groundproc.estimation.adjustment.factors import Factor, Unknowns, normal_equations, prior_factor
 from groundproc.estimation.adjustment.joining import (
@@ -24,9 +23,11 @@ from groundproc.estimation.adjustment.joining import (
     tilt_factor,
 )
 from groundproc.estimation.adjustment.patches import CHUNK, KEPT, PATCH_M, Patches, all_of, coarse, patches_of
-from groundproc.estimation.adjustment.planes import Clusters, placed
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.adjustment.planes import placed
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Attitudes, Positions
 
 Array = npt.NDArray[np.float64]
 START_NS = 1_779_000_000_000_000_000

@@ -11,9 +11,11 @@ from flightlog import frames
 from flightlog.errors import ConfigError
 from flightlog.hdl32e import ELEVATION_DEG, LASERS
 from groundproc.estimation.adjustment.lasers import PRIOR, UNKNOWNS, Corrections, shifted
-from groundproc.estimation.adjustment.planes import Clusters, Rows, rows_of
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS, Clusterer, Slice
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.adjustment.planes import Rows, rows_of
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.slices import Clusterer, Slice
+from groundproc.estimation.odometry.spline import Path
 from groundproc.sensors.lasers import LaserCorrections, read_lasers, write_lasers
 
 Array = npt.NDArray[np.float64]

@@ -9,8 +9,8 @@ from groundproc.estimation.adjustment.batch import Posterior
 from groundproc.estimation.adjustment.factors import Factor, Unknowns
 from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Carrying, Noise, followed, lasting, noise_of
 from groundproc.estimation.adjustment.planes import rows_of
-from groundproc.estimation.adjustment.scans import STEPS
 from groundproc.estimation.adjustment.solve import Problem, problem
+from groundproc.estimation.odometry.grid import STEPS
 from tests.helpers.circling import INTERVALS, circle, factors_of, room, unknowns_of_whole
 
 Array = npt.NDArray[np.float64]

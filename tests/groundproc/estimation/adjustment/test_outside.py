@@ -11,8 +11,8 @@ from flightlog import frames
 from groundproc.estimation.adjustment.batch import turned
 from groundproc.estimation.adjustment.factors import Factor, Unknowns
 from groundproc.estimation.adjustment.outside import DELAY, LEAST_SIGMA_M, Outside, laid_by_pieces, outside_factors
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 60

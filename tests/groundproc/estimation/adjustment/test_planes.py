@@ -5,9 +5,10 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from groundproc.estimation.adjustment.planes import TILT_PRIOR, Clusters, Rows, rows_of
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path, basis
+from groundproc.estimation.adjustment.planes import TILT_PRIOR, Rows, rows_of
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path, basis
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 8

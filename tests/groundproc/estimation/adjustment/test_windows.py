@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from flightlog import frames
 from groundproc.estimation.adjustment.anchors import Tie
 from groundproc.estimation.adjustment.batch import turned
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path
 from groundproc.estimation.adjustment.windows import Window, _laid_on, joined_path
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
 START_NS = 1_779_000_000_000_000_000

@@ -14,8 +14,8 @@ from scipy.interpolate import CubicSpline
 from flightlog import frames
 from flightlog.constants import NS_PER_S, STANDARD_GRAVITY_M_S2
 from flightlog.errors import LogError
-from groundproc.estimation.adjustment.scans import STEP_NS
 from groundproc.estimation.method import Given
+from groundproc.estimation.odometry.grid import STEP_NS
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg, LidarRun
 

@@ -11,13 +11,14 @@ from numba import njit
 from flightlog import frames
 from flightlog.constants import STANDARD_GRAVITY_M_S2
 from flightlog.errors import LogError
-from groundproc.estimation.adjustment.anchors import Attitudes, Positions
-from groundproc.estimation.adjustment.motion import Motion
-from groundproc.estimation.adjustment.odometry import Odometry, State, Step
-from groundproc.estimation.adjustment.planes import Clusters
-from groundproc.estimation.adjustment.scans import CLUSTER_DTYPE, SLICE_NS, STEP_NS, STEPS, Slice
-from groundproc.estimation.adjustment.spline import Path, integrated, smooth_path
-from groundproc.estimation.adjustment.voxels import FLATNESS, NORMAL, PlaneMap, find
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.odometry import Odometry, State, Step
+from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Slice
+from groundproc.estimation.odometry.spline import Path, integrated, smooth_path
+from groundproc.estimation.odometry.stated import Attitudes, Positions
+from groundproc.estimation.odometry.voxels import FLATNESS, NORMAL, PlaneMap, find
 from groundproc.numerics.voxelhash import spread, voxel_key
 from groundproc.trajectory.trajectory import Trajectory
 

@@ -12,7 +12,7 @@ from numba import njit
 from scipy.interpolate import CubicSpline
 
 from flightlog import frames
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.numerics.rotations import quat_turned
 
 Array = npt.NDArray[np.float64]

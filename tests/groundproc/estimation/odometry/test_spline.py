@@ -6,8 +6,8 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from flightlog import frames
-from groundproc.estimation.adjustment.scans import STEP_NS, STEPS
-from groundproc.estimation.adjustment.spline import Path, basis, integrated, smooth_path
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path, basis, integrated, smooth_path
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 7

@@ -14,18 +14,13 @@ from numba import njit
 
 from groundproc.cloud import placing as cloud
 from groundproc.estimation.method import Given, Progress
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.voxelhash import spread, voxel_key
 from groundproc.sensors import hdl32e as decode
 from groundproc.sensors.hdl32e import Gate
 
 Array = npt.NDArray[np.float64]
-
-STEP_NS: Final = 5_000_000
-"""Step of the grid that motion is kept on."""
-STEPS: Final = 20
-"""Grid steps of a slice."""
-SLICE_NS: Final = STEP_NS * STEPS
 
 CLUSTER_DTYPE: Final = np.dtype(
     [

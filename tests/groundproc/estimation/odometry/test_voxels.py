@@ -4,8 +4,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from groundproc.estimation.adjustment.scans import CLUSTER_DTYPE, STEP_NS, STEPS, Clusterer, Slice
-from groundproc.estimation.adjustment.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, PlaneMap, find
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
+from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, PlaneMap, find
 from groundproc.numerics.voxelhash import voxel_key
 
 Array = npt.NDArray[np.float64]

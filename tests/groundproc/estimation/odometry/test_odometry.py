@@ -10,8 +10,9 @@ import pytest
 
 from flightlog import frames
 from flightlog.constants import STANDARD_GRAVITY_M_S2
-from groundproc.estimation.adjustment.motion import Motion
-from groundproc.estimation.adjustment.odometry import (
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.odometry import (
     GYRO,
     POSITION,
     ROTATION,
@@ -21,8 +22,8 @@ from groundproc.estimation.adjustment.odometry import (
     State,
     observable,
 )
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
-from groundproc.estimation.adjustment.track import LOST_M, Bearing
+from groundproc.estimation.odometry.slices import Slice
+from groundproc.estimation.odometry.track import LOST_M, Bearing
 
 Array = npt.NDArray[np.float64]
 START_NS = 1_779_000_000_000_000_000

@@ -9,8 +9,8 @@ import pytest
 
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.adjustment.adjusted import RECOVERY_NS, measured
-from groundproc.estimation.adjustment.motion import LONGEST_SAMPLE_GAP_NS, on_grid
-from groundproc.estimation.adjustment.scans import STEP_NS
+from groundproc.estimation.odometry.grid import STEP_NS
+from groundproc.estimation.odometry.motion import LONGEST_SAMPLE_GAP_NS, on_grid
 
 Array = npt.NDArray[np.float64]
 STEP_S = STEP_NS * 1e-9

@@ -12,11 +12,12 @@ from typing import Final
 import numpy as np
 
 from flightlog import frames
-from groundproc.estimation.adjustment.motion import Motion
-from groundproc.estimation.adjustment.odometry import STATES, Odometry, State, Step
-from groundproc.estimation.adjustment.scans import SLICE_NS, STEP_NS, STEPS, Slice
-from groundproc.estimation.adjustment.track import KEPT, Track, thinned
-from groundproc.estimation.adjustment.voxels import PlaneMap
+from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.odometry import STATES, Odometry, State, Step
+from groundproc.estimation.odometry.slices import Slice
+from groundproc.estimation.odometry.track import KEPT, Track, thinned
+from groundproc.estimation.odometry.voxels import PlaneMap
 
 BEGINNING: Final = 150
 """Slices that are run again."""

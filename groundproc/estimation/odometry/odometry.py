@@ -14,19 +14,10 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog.constants import STANDARD_GRAVITY_M_S2
-from groundproc.estimation.adjustment.motion import Motion
-from groundproc.estimation.adjustment.scans import CLUSTER_DTYPE, STEP_NS, STEPS, Clusterer, Slice
-from groundproc.estimation.adjustment.voxels import (
-    COUNT,
-    FLATNESS,
-    LEVEL,
-    MEAN,
-    NORMAL,
-    SCATTER,
-    TILT,
-    PlaneMap,
-    find,
-)
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
+from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, TILT, PlaneMap, find
 from groundproc.numerics.rotations import mat_of_quat, quat_difference, quat_turned, unit_vector
 from groundproc.numerics.voxelhash import voxel_key
 

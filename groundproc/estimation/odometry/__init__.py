@@ -1,0 +1,13 @@
+"""Lidar-inertial odometry: slice after slice against the map of those before.
+
+grid        the grid that motion is kept on
+motion      rates and specific force of all inertial sensors on that grid
+slices      shots to slices of 0.1 s, and each slice to clusters: the returns of one voxel at one instant
+clusters    clusters of many slices, as columns
+voxels      a map of planes in a hash of voxels
+spline      uniform cubic B-splines, and the path that they correct
+stated      positions and attitudes of the autopilot
+odometry    an iterated error-state filter; the causal mode
+track       the forward pass: start, silent slices, fixes, loss of way
+beginning   the first seconds again, backwards
+"""

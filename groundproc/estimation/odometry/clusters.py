@@ -1,0 +1,32 @@
+"""Clusters of many slices, as columns."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Clusters:
+    """Clusters of all slices: columns of slices.CLUSTER_DTYPE.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+    xyz_m : ndarray of float32, shape (n, 3)
+    scatter_m2 : ndarray of float32, shape (n, 6)
+    count : ndarray of int32, shape (n,)
+    laser : ndarray of int32, shape (n,), optional
+        Given where the corrections of the single lasers are unknowns too.
+    """
+
+    time_ns: Ints
+    xyz_m: npt.NDArray[np.float32]
+    scatter_m2: npt.NDArray[np.float32]
+    count: npt.NDArray[np.int32]
+    laser: npt.NDArray[np.int32] | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
