@@ -5,7 +5,7 @@
 #   make check       format, lint, types, import contracts, then the tests
 #   make soak        the long tests: hour-long logs, many seeds
 #   make bench-NAME  one benchmark of benchmarks/; its last line is one JSON object
-#   make bench       all of them, into docs/benchmarks.md, but bench-study, which takes an hour and more
+#   make bench       all of them, into docs/benchmarks.md, but the longest: `benchmarks/all.py --only study windows`
 #   make clean       everything made, the environment included
 
 SHELL := /bin/bash

@@ -1,5 +1,10 @@
-"""Run every benchmark and write docs/benchmarks.md: figures, machine, versions. Run by `make bench`."""
+"""Run benchmarks and write docs/benchmarks.md: figures, machine, versions. Run by `make bench`.
 
+Every figure of the page is in docs/benchmarks.json, section by section, with the machine that it was measured on. `--only` measures some
+sections anew and leaves the others as they are; `--page` writes the page alone.
+"""
+
+import argparse
 import json
 import os
 import platform
@@ -7,26 +12,36 @@ import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "benchmarks.md"
-NO_BENCHMARKS = ("all", "drawing", "long_log", "machine", "study")
-"""This one, what others use, and what takes hours."""
-LIBRARIES = (
+ROOT: Final = Path(__file__).resolve().parents[1]
+PAGE: Final = ROOT / "docs" / "benchmarks.md"
+FIGURES: Final = ROOT / "docs" / "benchmarks.json"
+NO_BENCHMARKS: Final = ("all", "drawing", "long_log", "machine")
+"""This one, and what others use."""
+ON_DEMAND: Final = ("study", "windows")
+"""What takes an hour and more: measured where `--only` names it."""
+LIBRARIES: Final = (
     "swath", "numpy", "numba", "scipy", "mcap", "laspy", "lazrs", "pyproj", "pymavlink", "velodyne-decoder", "kiss-icp", "small_gicp",
 )  # fmt: skip
-
-
-NOTES = {"trajectory": "What the figures mean and how they are taken: [accuracy.md](accuracy.md)."}
+NOTES: Final = {
+    "trajectory": "What the figures mean and how they are taken: [accuracy.md](accuracy.md).",
+    "windows": "A long flight in windows, and a lap flown again and again; one line a figure.",
+}
 """What a section says before its figures."""
+HEAD: Final = """\
+# Benchmarks
+
+Written by `make bench` from docs/benchmarks.json. The peers of a benchmark are measured in turn with ours in the same run:
+ratios carry over to other machines, absolute figures do not."""
 
 
-def run(script: Path) -> dict[str, Any] | None:
+def run(name: str) -> dict[str, Any] | None:
     """Run one benchmark, its output shown as it comes; the JSON object of its last line, None where it failed."""
-    print(f"== {script.stem}", flush=True)
+    print(f"== {name}", flush=True)
     last = ""
-    with subprocess.Popen([sys.executable, script], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             print(line, end="", flush=True)
@@ -40,17 +55,18 @@ def run(script: Path) -> dict[str, Any] | None:
     return figures if isinstance(figures, dict) else None
 
 
-def processor() -> str:
-    """Name of the processor as the kernel tells it."""
+def machine() -> str:
+    """Processor and system, as the kernel tells them."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
-        return platform.processor() or platform.machine()
+        lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    processor = names[0] if names else platform.processor() or platform.machine()
+    return f"{processor}, {os.cpu_count()} processors, {platform.system()} {platform.release()}"
 
 
-def versions() -> dict[str, str]:
+def versions() -> str:
     """Versions of what the figures depend on."""
     found = {"Python": platform.python_version()}
     for name in LIBRARIES:
@@ -58,7 +74,7 @@ def versions() -> dict[str, str]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return ", ".join(f"{name} {number}" for name, number in found.items())
 
 
 def table(rows: dict[str, Any]) -> str:
@@ -80,26 +96,32 @@ def show(value: Any) -> str:
     return json.dumps(value) if isinstance(value, (dict, list)) else "-" if value is None else str(value)
 
 
+def page(sections: dict[str, Any]) -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for name, section in sorted(sections.items()):
+        parts += [f"## {name}", f"`make bench-{name}`"]
+        parts += [NOTES[name]] if name in NOTES else []
+        parts += ["It failed." if section["figures"] is None else table(section["figures"])]
+        parts += [f"On {section['machine']}; {section['versions']}."]
+    return "\n\n".join(parts) + "\n"
+
+
 def main() -> int:
-    """Run them all, write the page, and give 1 if any failed."""
-    scripts = sorted(ROOT.glob("benchmarks/[a-z]*.py"))
-    results = {script.stem: run(script) for script in scripts if script.stem not in NO_BENCHMARKS}
-    sections = [
-        f"## {name}\n\n`make bench-{name}`\n\n"
-        + (f"{NOTES[name]}\n\n" if name in NOTES else "")
-        + ("It failed." if figures is None else table(figures))
-        for name, figures in results.items()
-    ]
-    machine = f"{processor()}, {os.cpu_count()} processors, {platform.system()} {platform.release()}"
-    libraries = ", ".join(f"{name} {number}" for name, number in versions().items())
-    head = (
-        "# Benchmarks\n\n"
-        "Written by `make bench`; the peers of each were measured in turn in the same run. Ratios carry over to other machines, "
-        f"absolute figures do not.\n\nMachine: {machine}.\nVersions: {libraries}."
-    )
-    PAGE.write_text("\n\n".join([head, *sections]) + "\n")
+    """Run the benchmarks asked for, write the page, and give 1 if any failed."""
+    every = [path.stem for path in sorted(ROOT.glob("benchmarks/[a-z]*.py")) if path.stem not in NO_BENCHMARKS]
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=every, metavar="NAME", help=f"some of {', '.join(every)}")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the page")
+    arguments = parser.parse_args()
+    sections = json.loads(FIGURES.read_text()) if FIGURES.is_file() else {}
+    chosen = [] if arguments.page else arguments.only or [name for name in every if name not in ON_DEMAND]
+    for name in chosen:
+        sections[name] = {"machine": machine(), "versions": versions(), "figures": run(name)}
+        FIGURES.write_text(json.dumps(sections, indent=1, sort_keys=True) + "\n")
+    PAGE.write_text(page(sections))
     print(f"written: {PAGE.relative_to(ROOT)}")
-    return 1 if None in results.values() else 0
+    return 1 if any(sections[name]["figures"] is None for name in chosen) else 0
 
 
 if __name__ == "__main__":
