@@ -124,13 +124,13 @@ class Aircraft:
 
     def health(self) -> tuple[int, str]:
         done = subprocess.run(
-            [*SWATHD, "health", "--config", str(self.config)], capture_output=True, text=True, check=False, timeout=30
+            [*SWATHD, "health", "--config", str(self.config)], capture_output=True, text=True, check=False, timeout=120
         )
         return done.returncode, done.stdout
 
     def stop(self) -> LogReader:
         self.process.send_signal(signal.SIGTERM)
-        told = self.process.communicate(timeout=30)[1]
+        told = self.process.communicate(timeout=120)[1]
         assert self.process.returncode == 0, told
         self.autopilot.close()
         (log,) = sorted(self.logs.glob("*.mcap"))
@@ -162,7 +162,7 @@ def aircraft(tmp_path: Path) -> Iterator[Callable[..., Aircraft]]:
             one.kill()
 
 
-def until(condition: Callable[[], bool], what: str, seconds: float = 15.0) -> None:
+def until(condition: Callable[[], bool], what: str, seconds: float = 90.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"not within {seconds} s: {what}"

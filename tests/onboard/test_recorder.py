@@ -1,5 +1,6 @@
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -86,7 +87,10 @@ def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_th
     recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=100), lambda: segment(tmp_path / "a.mcap"))
     recorder.start()
     assert recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, b"one")], "ins"), True)
-    time.sleep(0.4)
+    synced, end = recorder.counts.syncs, time.monotonic() + 90
+    while recorder.counts.syncs < synced + 2:
+        assert time.monotonic() < end
+        time.sleep(0.02)
     copy = tmp_path / "copy.mcap"
     copy.write_bytes((tmp_path / "a.mcap").read_bytes())
     with LogReader(copy) as log:
@@ -100,18 +104,25 @@ def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_th
     assert recorder.counts.syncs >= 2
 
 
-def test_a_sync_follows_what_was_handed_over_when_it_is_nearly_due_and_no_sooner(tmp_path: Path) -> None:
+def test_a_sync_follows_what_was_handed_over_when_it_is_nearly_due_and_no_sooner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 10**12
+    monkeypatch.setattr("onboard.recorder.time", SimpleNamespace(monotonic_ns=lambda: now_ns))
     recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=4000), lambda: segment(tmp_path / "a.mcap"))
-    recorder.start()
-    for wait_s, syncs in ((0.1, 0), (3.55, 1)):  # of 4 s, seven eighths are near
-        time.sleep(wait_s)
+    begin_ns = now_ns
+    # of 4 s, seven eighths are near; what nobody says is handed over waits for the end of the four
+    for at_ms, told, syncs in ((100, True, 0), (3499, True, 0), (3500, True, 1), (7400, False, 1), (7500, False, 2)):
+        now_ns = begin_ns + at_ms * 10**6
         recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, b"one")], "ins"), True)
-        recorder.handed_over()
-        time.sleep(0.1)
-        assert recorder.counts.syncs == syncs
+        if told:
+            recorder.handed_over()
+            assert recorder.backlog.pressing.is_set() == (at_ms >= 3500)
+        recorder._go_round()
+        assert recorder.counts.syncs == syncs, at_ms
     with LogReader(tmp_path / "a.mcap") as log:
-        assert len(list(log.messages(("/mavlink/",)))) == 2
-    recorder.stop()
+        assert len(list(log.messages(("/mavlink/",)))) == 5
+    recorder._close_segment()
 
 
 def test_a_file_replaced_atomically_is_never_seen_half_written(tmp_path: Path) -> None:
