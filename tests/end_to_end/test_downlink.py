@@ -60,7 +60,9 @@ class Swathd:
     def play(self, log: Path, wrap: list[str] | None = None) -> None:
         words = ["--lidar-port", str(self.lidar), "--position-port", str(self.position)]
         words += ["--mavlink", f"udp:127.0.0.1:{self.mavlink}"]
-        subprocess.run([*(wrap or []), *SWATH, "replay", str(log), *words], check=True, capture_output=True, timeout=300)
+        subprocess.run(
+            [*(wrap or []), *SWATH, "replay", str(log), *words], check=True, capture_output=True, timeout=300
+        )
 
     def status(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads((self.logs / "status.json").read_text())
