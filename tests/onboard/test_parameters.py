@@ -233,6 +233,29 @@ def test_arming_in_between_ends_it(autopilot: Callable[..., Any]) -> None:
     assert board.parameters["E"] == [5, UINT8]
 
 
+def test_what_was_heard_three_seconds_ago_is_no_word_on_whether_it_is_armed(
+    autopilot: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Armed meanwhile, and then nothing at all is heard: both times what it said before counts for nothing."""
+    board = autopilot(small())
+    with ParameterLink(LinkConfig(board.device)) as link:
+        link.refuse_if_armed()
+        board.armed = True
+        link._heartbeat_ns -= 3 * 10**9  # as if that long had passed
+        with pytest.raises(UsageError, match="is armed; parameters are set only while it is disarmed"):
+            link.refuse_if_armed()
+        board.armed = False
+        before = link._heartbeat_ns
+        link._until(lambda: link._heartbeat_ns > before and not link._life.armed, 90.0)
+        board.mute = True
+        link._until(lambda: False, 0.6)  # what it has said is read
+        monkeypatch.setattr(parameter_link, "_HEARTBEAT_S", 0.6)
+        link.refuse_if_armed()  # that is less than a second old: good enough
+        link._heartbeat_ns -= 3 * 10**9
+        with pytest.raises(UsageError, match="is not heard any more; parameters are set only while it is"):
+            link.refuse_if_armed()
+
+
 def test_a_parameter_that_keeps_its_value_is_told_of(
     autopilot: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,3 +1,4 @@
+import os
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from flightlog import records
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from flightlog.records import HostClock
+from onboard import logfolder
 from onboard.config import RecorderConfig
 from onboard.logfolder import next_segment_path, write_atomically
 from onboard.recorder import Backlog, Recorder
@@ -123,6 +125,54 @@ def test_a_sync_follows_what_was_handed_over_when_it_is_nearly_due_and_no_sooner
     with LogReader(tmp_path / "a.mcap") as log:
         assert len(list(log.messages(("/mavlink/",)))) == 5
     recorder._close_segment()
+
+
+@pytest.fixture
+def forced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is forced on to the disk from here on, and what is renamed, by name and in order."""
+    found: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def noted(descriptor: int) -> None:
+        found.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        fsync(descriptor)
+
+    def renamed(source: str, target: Path) -> None:
+        found.append(f"-> {target.name}")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(os, "replace", renamed)
+    return found
+
+
+def test_names_and_contents_are_forced_on_to_the_disk_in_the_order_that_a_power_cut_needs(
+    tmp_path: Path, forced: list[str]
+) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    logfolder.sync_directory(folder)
+    assert forced == ["logs"]
+    forced.clear()
+    write_atomically(folder / "s", "one")  # the content, then the name, then the folder that holds it
+    assert forced == [".s.new", "-> s", "logs"]
+    forced.clear()
+    write_atomically(folder / "s", "two", sync=False)
+    assert forced == ["-> s"]
+    forced.clear()
+    logfolder.append_to_manifest(folder, {"file": "a"})
+    assert forced == ["manifest.jsonl", "logs"]
+
+
+def test_a_segment_is_on_the_disk_by_name_before_it_is_used_and_whole_before_it_is_in_the_manifest(
+    tmp_path: Path, forced: list[str]
+) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    opened = segment(folder / "00001-000.mcap")
+    assert forced == ["logs"]
+    opened.close()
+    assert forced == ["logs", "00001-000.mcap", "logs", "manifest.jsonl", "logs"]
 
 
 def test_a_file_replaced_atomically_is_never_seen_half_written(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The disk fills up: for real on a small tmpfs, and by what the file system says in the pure parts."""
 
+import contextlib
 import json
 import os
 import stat
@@ -143,6 +144,44 @@ def test_a_disk_that_fills_up_between_two_looks_tears_no_record_and_what_is_lost
         written = sum(1 for _ in log.messages())
     assert written - 1 + writing.counts.lost_on_disk == 2 * number
     assert line["drops"]["disk"] > 0
+
+
+def test_the_reserve_is_space_that_is_really_taken_and_is_given_back(tmp_path: Path) -> None:
+    logfolder.hold_reserve(tmp_path)
+    (held,) = tmp_path.iterdir()
+    assert held.stat().st_size >= 4 << 20
+    assert held.stat().st_blocks * 512 >= 4 << 20  # blocks of the disk, and not a file with a hole
+    logfolder.release_reserve(tmp_path)
+    logfolder.release_reserve(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.root
+@needs_root
+def test_where_there_is_no_room_for_a_reserve_none_is_left_behind(small_disk: Path) -> None:
+    (small_disk / "other").write_bytes(bytes(logfolder.free_bytes(small_disk) - (3 << 20)))
+    logfolder.hold_reserve(small_disk)
+    assert [path.name for path in small_disk.iterdir()] == ["other"]
+    assert logfolder.free_bytes(small_disk) > 2 << 20
+
+
+@pytest.mark.root
+@needs_root
+def test_a_log_on_a_disk_that_others_filled_to_the_last_byte_is_closed_out_of_the_reserve(small_disk: Path) -> None:
+    writing = recorder(small_disk, min_free_mb=1)
+    writing.start()
+    for number in range(5):
+        assert writing.put("/mavlink/ins", number, mavlink(number), True)
+    wait_for(lambda: writing.counts.messages == 5)
+    with (small_disk / "other").open("wb", buffering=0) as other, contextlib.suppress(OSError):
+        while True:
+            other.write(bytes(1 << 16))
+    wait_for(lambda: writing.counts.space is Space.FULL)
+    writing.stop()
+    assert writing.failure is None
+    (line,) = read_manifest(small_disk).values()
+    assert line["sha256"] == logfolder.sha256(small_disk / line["file"])
+    assert numbers(small_disk / line["file"]) == list(range(5))
 
 
 def finished(directory: Path, count: int) -> list[str]:
