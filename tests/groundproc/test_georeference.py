@@ -121,7 +121,7 @@ def sensor_xyz(packets: npt.NDArray[np.void], times: npt.NDArray[np.int64], shot
         steps = sorted((after - before) % 36_000 for before, after in pairwise(blocks))
         mine = packet == number
         firing = (shots.time_ns[mine] - times[number]) // 46_080
-        turned = steps[len(steps) // 2] * shots.laser[mine] * 1.152 / 46.08
+        turned = steps[len(steps) // 2] * (1.152 / 46.08) * shots.laser[mine]
         azimuth_deg[mine] = (np.array(blocks)[firing] + turned) / 100.0
     azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(hdl32e.ELEVATION_DEG)[shots.laser]
     reach_m = shots.range_steps * 0.002
