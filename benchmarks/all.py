@@ -11,8 +11,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
-NO_BENCHMARKS = ("all", "drawing", "long_log", "machine", "study")
-"""This one, what others use, and what takes hours."""
+NO_BENCHMARKS = ("all", "drawing", "long_log", "machine", "mutations", "study")
+"""This one, what others use, what takes hours, and what measures the tests."""
 LIBRARIES = (
     "swath", "numpy", "numba", "scipy", "mcap", "laspy", "lazrs", "pyproj", "pymavlink", "velodyne-decoder", "kiss-icp", "small_gicp",
 )  # fmt: skip

@@ -1,4 +1,6 @@
+import json
 import os
+import stat
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +46,22 @@ def test_the_boot_counter_outlives_the_logs_and_the_logs_outlive_the_counter(tmp
     (tmp_path / "00008-000.mcap").touch()
     (tmp_path / "boot.json").write_text("{ damaged")
     assert next_segment_path(tmp_path, "d").name == "00009-000.mcap"
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "null", "{}", '{"boot_id": "a"}', '{"number": 3}', '{"boot_id": "a", "number": null}', "\x00"]
+)
+def test_a_counter_that_cannot_be_read_is_begun_anew_after_the_logs_that_are_there(
+    tmp_path: Path, content: str
+) -> None:
+    folder = tmp_path / "deep" / "logs"
+    assert next_segment_path(folder, "a").name == "00001-000.mcap"  # the folder is made, with those above it
+    assert json.loads((folder / "boot.json").read_text()) == {"boot_id": "a", "number": 1}
+    (folder / "boot.json").write_text(content)
+    (folder / "00004-002.mcap").touch()
+    assert next_segment_path(folder, "a").name == "00005-000.mcap"
+    assert next_segment_path(folder, "a").name == "00005-000.mcap"
+    assert json.loads((folder / "boot.json").read_text()) == {"boot_id": "a", "number": 5}
 
 
 @pytest.mark.parametrize("folder", ["file/logs", "file"])
@@ -176,7 +194,12 @@ def test_a_segment_is_on_the_disk_by_name_before_it_is_used_and_whole_before_it_
 
 
 def test_a_file_replaced_atomically_is_never_seen_half_written(tmp_path: Path) -> None:
-    write_atomically(tmp_path / "s", "one")
-    write_atomically(tmp_path / "s", "two", sync=False)
+    before = os.umask(0o077)
+    try:
+        write_atomically(tmp_path / "s", "one")
+        write_atomically(tmp_path / "s", "two", sync=False)
+    finally:
+        os.umask(before)
     assert (tmp_path / "s").read_text() == "two"
+    assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o644  # others may read it, whatever the umask
     assert [path.name for path in tmp_path.iterdir()] == ["s"]
