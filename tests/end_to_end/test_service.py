@@ -120,8 +120,8 @@ class Guest:
             )  # fmt: skip
 
     def boot(self) -> None:
-        self.wait_for(lambda: self.leader is not None, 60)
-        self.wait_for(lambda: self.systemctl("is-system-running").strip() in ("running", "degraded"), 60)
+        self.wait_for(lambda: self.leader is not None)
+        self.wait_for(lambda: self.systemctl("is-system-running").strip() in ("running", "degraded"))
         # the lidar on a cable of its own, and a stranger on another
         for words in (
             "link add name lidar0 type veth peer name plug0", "link set plug0 up", "link set lidar0 up",
@@ -197,10 +197,10 @@ class Guest:
         if self.leader is not None:
             os.kill(self.leader, signal.SIGRTMIN + 14)  # poweroff at once, as systemd(1) has it
         try:
-            self.process.wait(30)
+            self.process.wait(120)
         except subprocess.TimeoutExpired:
             os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait(10)
+            self.process.wait(60)
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def guest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guest]:
 
 
 def test_it_starts_with_the_system_and_is_ready(guest: Guest) -> None:
-    guest.wait_for(lambda: guest.show("ActiveState") == "active", 30)
+    guest.wait_for(lambda: guest.show("ActiveState") == "active")
     assert guest.show("NRestarts") == "0"
     assert guest.show("UnitFileState") == "enabled"
     assert guest.show("StatusText").startswith("00001-000.mcap: lidar ")
