@@ -187,6 +187,27 @@ def test_half_of_all_frames_may_be_lost_and_everything_is_read_and_set(autopilot
     assert {name for name, _, _ in board.sets} == {"P3", "P4"}
 
 
+def test_what_is_asked_again_is_counted_and_what_is_not_there_not_asked_for_ever(
+    autopilot: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parameter_link, "_TRIES", 8)
+    board = autopilot(small())
+    with ParameterLink(LinkConfig(board.device)) as link:
+        assert link.read(["A", "NOT_THERE"]) == {"A": 1.0}
+        asked = board.heard["PARAM_REQUEST_READ"]
+        assert asked < 2 + 7  # not in all eight tries
+        assert link.counts.repeated == asked - 2
+        assert set(link.read_all()) == set(small())
+        before = board.heard["PARAM_REQUEST_READ"] - 2
+        assert link.counts.repeated == before
+        monkeypatch.setattr(parameter_link, "_TRIES", 3)
+        board.lose = lambda n: True
+        link._until(lambda: False, 1.0)  # what was still on its way is heard
+        with pytest.raises(SourceError, match=": all parameters did not come in 3 tries"):
+            link.read_all()
+        assert link.counts.repeated == before + 3
+
+
 def test_a_set_is_sent_with_the_parameters_own_type_as_a_number(autopilot: Callable[..., Any]) -> None:
     board = autopilot(small(), version=2)
     with ParameterLink(LinkConfig(board.device)) as link:
