@@ -200,6 +200,7 @@ def test_what_is_asked_again_is_counted_and_what_is_not_there_not_asked_for_ever
         assert set(link.read_all()) == set(small())
         before = board.heard["PARAM_REQUEST_READ"] - 2
         assert link.counts.repeated == before
+        assert link.counts.sent == sum(board.heard.values())
         monkeypatch.setattr(parameter_link, "_TRIES", 3)
         board.lose = lambda n: True
         link._until(lambda: False, 1.0)  # what was still on its way is heard
