@@ -152,7 +152,10 @@ def forced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     fsync, replace = os.fsync, os.replace
 
     def noted(descriptor: int) -> None:
-        found.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        found.append(
+            path.name if path.is_dir() or path.suffix == ".mcap" else f"{path.name}: {path.read_text().strip()}"
+        )
         fsync(descriptor)
 
     def renamed(source: str, target: Path) -> None:
@@ -173,13 +176,13 @@ def test_names_and_contents_are_forced_on_to_the_disk_in_the_order_that_a_power_
     assert forced == ["logs"]
     forced.clear()
     write_atomically(folder / "s", "one")  # the content, then the name, then the folder that holds it
-    assert forced == [".s.new", "-> s", "logs"]
+    assert forced == [".s.new: one", "-> s", "logs"]
     forced.clear()
     write_atomically(folder / "s", "two", sync=False)
     assert forced == ["-> s"]
     forced.clear()
     logfolder.append_to_manifest(folder, {"file": "a"})
-    assert forced == ["manifest.jsonl", "logs"]
+    assert forced == ['manifest.jsonl: {"file": "a"}', "logs"]
 
 
 def test_a_segment_is_on_the_disk_by_name_before_it_is_used_and_whole_before_it_is_in_the_manifest(
@@ -190,7 +193,7 @@ def test_a_segment_is_on_the_disk_by_name_before_it_is_used_and_whole_before_it_
     opened = segment(folder / "00001-000.mcap")
     assert forced == ["logs"]
     opened.close()
-    assert forced == ["logs", "00001-000.mcap", "logs", "manifest.jsonl", "logs"]
+    assert [word.partition(":")[0] for word in forced] == ["logs", "00001-000.mcap", "logs", "manifest.jsonl", "logs"]
 
 
 def test_a_file_replaced_atomically_is_never_seen_half_written(tmp_path: Path) -> None:
