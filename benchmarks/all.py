@@ -17,8 +17,8 @@ from typing import Any, Final
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "benchmarks.md"
 FIGURES: Final = ROOT / "docs" / "benchmarks.json"
-NO_BENCHMARKS: Final = ("all", "drawing", "long_log", "machine")
-"""This one, and what others use."""
+NO_BENCHMARKS: Final = ("all", "drawing", "long_log", "machine", "mutations")
+"""This one, what others use, and what measures the tests."""
 ON_DEMAND: Final = ("study", "windows")
 """What takes an hour and more: measured where `--only` names it."""
 LIBRARIES: Final = (

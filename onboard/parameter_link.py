@@ -155,8 +155,9 @@ class ParameterLink:
                 for index in part:
                     self._send(self._mavlink.param_request_read_encode(system, component, b"", index))
                 self._until(functools.partial(self._have, part), _WAIT_S)
-        if not self.values or (missing := self._missing()):
-            raise SourceError(f"{self._device}: {len(missing) or 'all'} parameters did not come in {_TRIES} tries")
+        if not self.values or self._missing():
+            lost = len(self._missing()) if self.values else "all"
+            raise SourceError(f"{self._device}: {lost} parameters did not come in {_TRIES} tries")
         return {name: value.value for name, value in sorted(self.values.items())}
 
     def _have(self, part: Sequence[int]) -> bool:

@@ -12,6 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import HealthCheck, settings
+
+# no test judges by a clock, and so no example does
+settings.register_profile("swath", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("swath")
 
 
 @dataclass(frozen=True)
@@ -79,9 +84,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulat
         try:
             folder.mkdir()
         except FileExistsError:  # made already, or another worker is at it
-            deadline = time.monotonic() + 300.0
+            deadline = time.monotonic() + 900.0
             while not done.exists():
-                assert time.monotonic() < deadline, f"{name}: the worker that simulates it has not finished in 300 s"
+                assert time.monotonic() < deadline, f"{name}: the worker that simulates it has not finished in 900 s"
                 time.sleep(0.1)
             return Simulated(folder)
         _render(folder, scene, seconds, seed, options, every, points)

@@ -28,7 +28,7 @@ def health(folder: Path) -> tuple[int, str]:
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
+    end = time.monotonic() + 120
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.1)
@@ -63,7 +63,7 @@ def test_the_lidar_stops_mavlink_goes_on_then_the_log_is_closed_and_begins_again
             wait_for(lambda: recorder()["space"] == "room" and recorder()["segments"] == 2)
             time.sleep(1.0)
             daemon.terminate()
-            assert daemon.wait(20) == 0
+            assert daemon.wait(120) == 0
         first, second = sorted((disk / "logs").glob("*.mcap"))
         lines = logfolder.read_manifest(disk / "logs")
         for log in (first, second):

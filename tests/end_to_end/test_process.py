@@ -619,7 +619,7 @@ def test_the_command_itself_ends_with_one_sentence_and_its_code(tmp_path: Path) 
         "-o",
         str(tmp_path / "out"),
     ]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert run.returncode == 1
     assert run.stdout == ""
     assert len(run.stderr.strip().splitlines()) == 1

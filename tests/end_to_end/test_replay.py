@@ -48,20 +48,27 @@ def test_a_replayed_flight_is_recorded_bit_for_bit(tmp_path: Path, dual_flight: 
         "recorder": {"directory": str(tmp_path / "logs")},
     }  # fmt: skip
     config.write_text(json.dumps(tree))
+
+    def status() -> dict[str, Any]:
+        return dict(json.loads((tmp_path / "logs" / "status.json").read_text()))
+
     daemon = subprocess.Popen(
         [sys.executable, "-m", "onboard.cli", "run", "--config", str(config)], stderr=subprocess.PIPE, text=True
     )
     try:
-        until(lambda: (tmp_path / "logs" / "status.json").exists() or daemon.poll() is not None, 20)
+        until(lambda: (tmp_path / "logs" / "status.json").exists() or daemon.poll() is not None)
         assert daemon.poll() is None, daemon.communicate()[1]
         words = ["--lidar-port", str(lidar), "--position-port", str(position), "--mavlink", f"udp:127.0.0.1:{mavlink}"]
         program = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
         command = [sys.executable, "-c", program, "replay", str(dual_flight.log), *words]
-        played = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=os.environ)
+        played = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, env=os.environ)
         assert played.returncode == 0, played.stderr
-        time.sleep(0.5)
+        packets = len(contents(dual_flight.log)["data"])
+        until(lambda: status()["lidar"]["received"] >= packets)
+        came_s = status()["uptime_s"]
+        until(lambda: status()["uptime_s"] > came_s + 1.5)  # nothing waits anywhere any more
         daemon.send_signal(signal.SIGTERM)
-        stderr = daemon.communicate(timeout=30)[1]
+        stderr = daemon.communicate(timeout=120)[1]
     finally:
         daemon.kill()
         daemon.wait()
@@ -74,7 +81,7 @@ def test_a_replayed_flight_is_recorded_bit_for_bit(tmp_path: Path, dual_flight: 
     assert b"".join(recorded["mavlink"]) == b"".join(sent["mavlink"])
 
 
-def until(condition: Callable[[], bool], seconds: float) -> None:
+def until(condition: Callable[[], bool], seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"

@@ -178,3 +178,13 @@ def test_any_bytes_behind_the_first_declaration_are_a_log(parts: list[bytes]) ->
     data = FMT + b"".join(parts)
     log = dataflash.parse(data, "a.bin")
     assert 0 <= log.bad_bytes <= len(data)
+
+
+def test_a_message_of_a_single_byte_is_read_and_one_with_two_fields_of_a_name_is_passed_over_by_its_length() -> None:
+    one = declared(1, "ONE", "B", "a") + message(1, "B", 7) + message(1, "B", 8)
+    twice = declared(2, "TWO", "BB", "a,a") + message(2, "BB", 1, 2)
+    nameless = declared(3, "NON", "BB", "a,") + message(3, "BB", 1, 2)
+    own = declared(0x80, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+    log = dataflash.parse(own + one + twice + nameless, "x.bin")
+    assert {name: table["a"].tolist() for name, table in log.tables.items()} == {"ONE": [7, 8]}
+    assert log.bad_bytes == 5 + 5

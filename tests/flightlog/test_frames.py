@@ -179,3 +179,10 @@ def test_frd_to_rfu_is_its_own_inverse_and_keeps_handedness(vector: Array) -> No
     assert (frames.ins_from_frd(frames.ins_from_frd(vector)) == vector).all()
     assert (frames.ins_from_frd(np.array([1.0, 2.0, 3.0])) == [2.0, 1.0, -3.0]).all()
     assert np.linalg.det(frames.ins_from_frd(np.eye(3))) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_a_nose_straight_up_or_down_has_its_pitch_though_the_matrix_is_rounded_beyond_one(up: float) -> None:
+    mat = frames.mat_local_ins(0.3, up * np.pi / 2, 0.0)
+    mat[2, 1] = np.nextafter(up, 2 * up)
+    assert frames.attitude_of(mat)[1] == up * np.pi / 2

@@ -1,4 +1,6 @@
+import time
 from calendar import timegm
+from collections.abc import Iterator
 
 import pytest
 import velodyne_decoder
@@ -101,6 +103,37 @@ def test_a_sentence_that_was_cut_gives_the_right_time_or_none(length: int) -> No
 )
 def test_a_sealed_sentence_without_a_possible_time_is_none(fields: str) -> None:
     assert parse_rmc(sealed(fields)) is None
+
+
+@pytest.fixture
+def far_from_greenwich(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "Pacific/Auckland")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("far_from_greenwich")
+@pytest.mark.parametrize(
+    ("place", "valid", "body"),
+    [
+        ((57.5, 15.25), True, "GPRMC,220632,A,5730.0000,N,01515.0000,E,000.0,000.0,111212,000.0,E"),
+        ((-7.125, -100.0), False, "GPRMC,220632,V,0707.5000,S,10000.0000,W,000.0,000.0,111212,000.0,E"),
+        ((0.0, 0.0), True, "GPRMC,220632,A,0000.0000,N,00000.0000,E,000.0,000.0,111212,000.0,E"),
+    ],
+)
+def test_a_sentence_is_written_letter_by_letter_as_a_receiver_writes_it(
+    place: tuple[float, float], valid: bool, body: str
+) -> None:
+    utc_ns = timegm((2012, 12, 11, 22, 6, 32)) * 10**9
+    written = format_rmc(utc_ns + 999_999_999, *place, valid=valid)
+    assert written == sealed(body)
+    assert valid is False or written == format_rmc(utc_ns, *place)
+
+
+def test_the_checksum_of_what_is_no_ascii_takes_it_for_question_marks() -> None:
+    assert checksum("GPÄ") == checksum("GP?") == ord("G") ^ ord("P") ^ ord("?")
 
 
 @given(st.text() | st.binary())

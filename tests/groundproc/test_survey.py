@@ -1,6 +1,9 @@
 """survey.yaml and which mount holds."""
 
+import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -8,7 +11,7 @@ import yaml
 from flightlog import config
 from flightlog.errors import ConfigError
 from flightlog.logfile import LogReader, LogWriter
-from flightlog.mount import Mount
+from flightlog.mount import LidarMount, Mount
 from groundproc.flight.mounting import find_mount
 from groundproc.survey import Survey
 
@@ -29,27 +32,62 @@ def test_the_sample_is_the_defaults_with_a_word_about_each(tmp_path: Path) -> No
         assert name in text
 
 
-def test_every_option_can_be_set(tmp_path: Path) -> None:
-    chosen = survey(
-        tmp_path,
-        """
-        mount: {lidar: {position_m: [0.01, 0.02, -0.2], pitch_deg: -30}, gps_position_m: [0, -0.1, 0.2]}
-        crs: 3006
-        height: ellipsoid
-        geoid: "29.35"
-        method: ins
-        pose_grid_ms: 10
-        sync: host
-        fov_deg: [0, 360]
-        min_range_m: 2
-        max_range_m: 50
-        """,
-    )
-    assert isinstance(chosen.mount, Mount)
-    assert chosen.mount.lidar.position_m == (0.01, 0.02, -0.2)
-    assert chosen.mount.lidar.roll_deg == 0.0
-    assert (chosen.crs, chosen.height, chosen.geoid, chosen.pose_grid_ms) == (3006, "ellipsoid", "29.35", 10.0)
-    assert (chosen.sync, chosen.fov_deg, chosen.min_range_m, chosen.max_range_m) == ("host", (0.0, 360.0), 2.0, 50.0)
+OTHERS: dict[str, object] = {
+    "mount": {"lidar": {"position_m": [0.01, 0.02, -0.2], "pitch_deg": -30}, "gps_position_m": [0, -0.1, 0.2]},
+    "crs": 3006,
+    "geoid": "29.35",
+    "fov_deg": [0.0, 360.0],
+    "pose_grid_ms": 10.0,
+}
+"""Values of options that are not seen from their defaults and bounds."""
+
+
+def leaves(made: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], "dataclasses.Field[Any]", Any]]:
+    """Every option, those of sections within too: path of names, field, default."""
+    for field in dataclasses.fields(made):
+        value = getattr(made, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaves(value, (*above, field.name))
+        else:
+            yield (*above, field.name), field, value
+
+
+def other(field: "dataclasses.Field[Any]", default: Any) -> Any:
+    """A value of an option that is allowed and not its default."""
+    if field.name in OTHERS:
+        return OTHERS[field.name]
+    if choices := field.metadata["choices"]:
+        return next(choice for choice in choices if choice != default)
+    if isinstance(default, bool):
+        return not default
+    if isinstance(default, tuple):
+        return list(default[:-1])
+    if isinstance(default, int | float):
+        low, high = field.metadata["minimum"], field.metadata["maximum"]
+        return type(default)((default + high) / 2 if high not in (None, default) else (default + low) / 2)
+    return "some-file"
+
+
+@pytest.mark.parametrize(
+    ("path", "field", "default"), [pytest.param(*leaf, id=".".join(leaf[0])) for leaf in leaves(Survey())]
+)
+def test_every_option_can_be_set(
+    tmp_path: Path, path: tuple[str, ...], field: "dataclasses.Field[Any]", default: Any
+) -> None:
+    value = other(field, default)
+    tree: Any = value
+    for name in reversed(path):
+        tree = {name: tree}
+    chosen = survey(tmp_path, yaml.safe_dump(tree))
+    found = {names: leaf for names, _, leaf in leaves(chosen) if names[: len(path)] == path}
+    assert found != {path: default}
+    if path == ("mount",):
+        assert chosen.mount == Mount(LidarMount((0.01, 0.02, -0.2), pitch_deg=-30.0), (0.0, -0.1, 0.2))
+    else:
+        assert found == {path: tuple(value) if isinstance(value, list) else value}
+    # and nothing else has changed
+    untouched = {names: leaf for names, _, leaf in leaves(Survey()) if names != path}
+    assert {names: leaf for names, _, leaf in leaves(chosen) if names[: len(path)] != path} == untouched
     assert config.loads(config.dump(chosen), Survey, "again") == chosen
 
 

@@ -105,7 +105,7 @@ def recording(folder: Path, logs: Path, *, lidar: bool, **recorder: Any) -> Iter
 
 
 def wait_for_segment(logs: Path) -> None:
-    end = time.monotonic() + 20
+    end = time.monotonic() + 120
     while not any(path.stat().st_size for path in logs.glob("*.mcap")):
         assert time.monotonic() < end
         time.sleep(0.05)

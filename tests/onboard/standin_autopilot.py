@@ -37,6 +37,8 @@ class StandinAutopilot:
     ) -> None:
         self.parameters, self.version, self.lose, self.stubborn = parameters, version, lose, stubborn
         self.armed, self.arm_after_sets = False, arm_after_sets
+        self.mute = False
+        """Sends nothing more."""
         self.heard: Counter[str] = Counter()
         self.sets: list[tuple[str, float, int]] = []
         self.lost = 0
@@ -82,6 +84,8 @@ class StandinAutopilot:
         return lost
 
     def _write(self, message: Any, mavlink: Any = None) -> None:
+        if self.mute:
+            return
         os.write(self._master, message.pack(mavlink or self._out, force_mavlink1=self.version == 1))
 
     def _answer(self, message: Any) -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flightlog.errors import LogError
 from onboard import cli, gate
 from onboard.gate import RefusedError, Wish, wish
 from onboard.logfolder import ACKNOWLEDGED, MANIFEST
@@ -83,6 +84,23 @@ def test_acknowledged_once_and_only_what_the_manifest_has(tmp_path: Path) -> Non
         gate.acknowledge(tmp_path, ("0" * 64,))
     lines = [json.loads(line) for line in (tmp_path / ACKNOWLEDGED).read_text().splitlines()]
     assert lines == [{"file": "00001-000.mcap", "sha256": first}, {"file": "00001-001.mcap", "sha256": second}]
+
+
+def test_a_folder_that_cannot_be_read_or_written_is_one_sentence(tmp_path: Path) -> None:
+    first = put(tmp_path, "00001-000.mcap", b"one")
+    (tmp_path / ACKNOWLEDGED).mkdir()
+    with pytest.raises(LogError, match=rf"^{tmp_path}: cannot be read \(Is a directory\)$"):
+        gate.manifest(tmp_path)
+    with pytest.raises(LogError, match=rf"^{tmp_path}/{ACKNOWLEDGED}: cannot be written \(Is a directory\)$"):
+        gate.acknowledge(tmp_path, (first,))
+
+
+def test_a_segment_that_cannot_be_looked_at_is_not_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a card that fails: it was there a moment ago."""
+    put(tmp_path, "00001-000.mcap", b"one")
+    monkeypatch.setattr(Path, "is_file", lambda self: True)
+    (tmp_path / "00001-000.mcap").unlink()
+    assert gate.manifest(tmp_path) == []
 
 
 def test_a_refusal_ends_with_the_code_of_a_command_that_may_not_be_run(

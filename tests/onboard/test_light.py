@@ -14,7 +14,7 @@ def test_the_daemon_runs_with_no_ground_library_installed() -> None:
         "import onboard.daemon, onboard.cli, onboard.notify\n"
         "sys.exit(onboard.cli.main(['config']))\n"
     )
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=300)
     assert run.returncode == 0, run.stderr
     assert "data_port: 2368" in run.stdout
 
@@ -29,7 +29,7 @@ def test_health_loads_nothing_that_takes_time(tmp_path: Path) -> None:
     config = tmp_path / "swathd.yaml"
     config.write_text(f"recorder: {{directory: {tmp_path}}}\n")
     run = subprocess.run(
-        [sys.executable, "-c", program, config], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", program, config], capture_output=True, text=True, check=False, timeout=300
     )
     assert run.returncode == 2, run.stderr
     assert "swathd has not run" in run.stdout

@@ -187,6 +187,28 @@ def test_half_of_all_frames_may_be_lost_and_everything_is_read_and_set(autopilot
     assert {name for name, _, _ in board.sets} == {"P3", "P4"}
 
 
+def test_what_is_asked_again_is_counted_and_what_is_not_there_not_asked_for_ever(
+    autopilot: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parameter_link, "_TRIES", 8)
+    board = autopilot(small())
+    with ParameterLink(LinkConfig(board.device)) as link:
+        assert link.read(["A", "NOT_THERE"]) == {"A": 1.0}
+        asked = board.heard["PARAM_REQUEST_READ"]
+        assert asked < 2 + 7  # not in all eight tries
+        assert link.counts.repeated == asked - 2
+        assert set(link.read_all()) == set(small())
+        before = board.heard["PARAM_REQUEST_READ"] - 2
+        assert link.counts.repeated == before
+        assert link.counts.sent == sum(board.heard.values())
+        monkeypatch.setattr(parameter_link, "_TRIES", 3)
+        board.lose = lambda n: True
+        link._until(lambda: False, 1.0)  # what was still on its way is heard
+        with pytest.raises(SourceError, match=": all parameters did not come in 3 tries"):
+            link.read_all()
+        assert link.counts.repeated == before + 3
+
+
 def test_a_set_is_sent_with_the_parameters_own_type_as_a_number(autopilot: Callable[..., Any]) -> None:
     board = autopilot(small(), version=2)
     with ParameterLink(LinkConfig(board.device)) as link:
@@ -231,6 +253,29 @@ def test_arming_in_between_ends_it(autopilot: Callable[..., Any]) -> None:
         link.apply([Difference("A", 2.0, 1.0), Difference("E", 6.0, 5.0)])
     assert [name for name, _, _ in board.sets] == ["A"]
     assert board.parameters["E"] == [5, UINT8]
+
+
+def test_what_was_heard_three_seconds_ago_is_no_word_on_whether_it_is_armed(
+    autopilot: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Armed meanwhile, and then nothing at all is heard: both times what it said before counts for nothing."""
+    board = autopilot(small())
+    with ParameterLink(LinkConfig(board.device)) as link:
+        link.refuse_if_armed()
+        board.armed = True
+        link._heartbeat_ns -= 3 * 10**9  # as if that long had passed
+        with pytest.raises(UsageError, match="is armed; parameters are set only while it is disarmed"):
+            link.refuse_if_armed()
+        board.armed = False
+        before = link._heartbeat_ns
+        link._until(lambda: link._heartbeat_ns > before and not link._life.armed, 90.0)
+        board.mute = True
+        link._until(lambda: False, 0.6)  # what it has said is read
+        monkeypatch.setattr(parameter_link, "_HEARTBEAT_S", 0.6)
+        link.refuse_if_armed()  # that is less than a second old: good enough
+        link._heartbeat_ns -= 3 * 10**9
+        with pytest.raises(UsageError, match="is not heard any more; parameters are set only while it is"):
+            link.refuse_if_armed()
 
 
 def test_a_parameter_that_keeps_its_value_is_told_of(

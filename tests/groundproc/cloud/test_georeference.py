@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -98,7 +99,7 @@ def test_every_point_is_where_the_sources_equation_puts_it(
     shots = decode.decode(packets, times)
     # step 2: p2 = p1 R(mount) + lever arm; step 3: p3 = p2 R(-heading, pitch, roll) + position
     heading, pitch, roll = attitude
-    on_airframe = sensor_xyz(shots) @ by_the_source(*mount) + np.array(lever)
+    on_airframe = sensor_xyz(packets, times, shots) @ by_the_source(*mount) + np.array(lever)
     expected = on_airframe @ by_the_source(-heading, pitch, roll) + np.array(position)
     np.testing.assert_allclose(points.xyz_m, expected, atol=1e-6)
     assert (points.time_ns == shots.time_ns).all()
@@ -106,23 +107,29 @@ def test_every_point_is_where_the_sources_equation_puts_it(
         assert (getattr(points, name) == getattr(shots, name)).all()
 
 
-def sensor_xyz(shots: decode.Shots) -> Array:
-    """Step 1 in float64, from what is whole in the shots: azimuth of the block by its time, range, laser."""
-    # each packet of `turning` begins a firing later: 16.5888 steps of 0.01 deg, rounded at the block, step 16 or 17 by the median
-    elevation = np.deg2rad(hdl32e.ELEVATION_DEG)[shots.laser]
-    across = np.arctan2(shots.xyz_m[:, 0].astype(np.float64), shots.xyz_m[:, 1].astype(np.float64))
-    # the azimuth is a multiple of 0.01 deg plus one of the step (a whole or half number) times the laser's fortieth
-    grid = 0.01 / 80.0
-    azimuth = np.rint(np.rad2deg(across) / grid) * grid
-    reach = shots.range_steps * 0.002
-    return np.stack(
-        [
-            reach * np.cos(elevation) * np.sin(np.deg2rad(azimuth)),
-            reach * np.cos(elevation) * np.cos(np.deg2rad(azimuth)),
-            reach * np.sin(elevation),
-        ],
-        axis=1,
+def sensor_xyz(packets: npt.NDArray[np.void], times: npt.NDArray[np.int64], shots: decode.Shots) -> Array:
+    """Step 1 in float64 from the packets' bytes: where the rotor stood when each laser fired (manual, appendix on firing times).
+
+    Of the shots only time, laser and range are taken. A firing lasts 46.08 us, the lasers of it follow each other every 1.152 us, and
+    the rotor turns on meanwhile by the packet's own step: the middle one of those from each firing to the next.
+    """
+    azimuth_deg = np.empty(len(shots))
+    packet = np.searchsorted(times, shots.time_ns, side="right") - 1
+    for number, payload in enumerate(packets):
+        content = payload.tobytes()
+        each = 2 if content[1204] == 0x39 else 1  # blocks of a firing
+        blocks = [struct.unpack_from("<H", content, 100 * block + 2)[0] for block in range(0, 12, each)]
+        steps = sorted((after - before) % 36_000 for before, after in pairwise(blocks))
+        mine = packet == number
+        firing = (shots.time_ns[mine] - times[number]) // 46_080
+        turned = steps[len(steps) // 2] * (1.152 / 46.08) * shots.laser[mine]
+        azimuth_deg[mine] = (np.array(blocks)[firing] + turned) / 100.0
+    azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(hdl32e.ELEVATION_DEG)[shots.laser]
+    reach_m = shots.range_steps * 0.002
+    across = np.stack(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=1
     )
+    return np.asarray(reach_m[:, None] * across)
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 180.0, 270.0, 33.0])
@@ -173,7 +180,7 @@ def test_each_firing_has_the_pose_of_its_own_middle() -> None:
     firing = (shots.time_ns - START_NS) // 46_080
     middle_s = (firing * 46_080 + 17_856) * 1e-9
     tilt = Rotation.from_euler("X", -20.0, degrees=True)
-    on_airframe = tilt.apply(sensor_xyz(shots)) + np.array([0.0, 0.0, -0.16])
+    on_airframe = tilt.apply(sensor_xyz(packets, times, shots)) + np.array([0.0, 0.0, -0.16])
     expected = (base * Rotation.from_rotvec(middle_s[:, None] * spin)).apply(on_airframe) + middle_s[:, None] * speed
     np.testing.assert_allclose(points.xyz_m, expected, atol=2e-6)
     # and that is what the docstring says of a pose of every shot's own instant: 50 deg/s at 50 m is 0.8 mm

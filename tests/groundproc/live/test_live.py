@@ -36,7 +36,7 @@ from groundproc.live.voxelcloud import VoxelCloud
 from groundproc.sensors.hdl32e import Gate
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def until(condition: Callable[[], bool], seconds: float = 90.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"
@@ -451,7 +451,7 @@ def served() -> Iterator[tuple[StandIn, int]]:
 
 
 def get(port: int, path: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
     try:
         connection.request("GET", path, headers={} if host is None else {"Host": host})
         answer = connection.getresponse()
