@@ -92,7 +92,9 @@ class Daemon:
         try:
             keep_free_bytes = 2 * settings.recorder.min_free_mb << 20
             self._salvager = leftovers.begin(self._directory, keep_free_bytes, settings.recorder.compression)
-            self._recorder = Recorder(settings.recorder, lambda: self._open_segment(settings, mount))
+            self._recorder = Recorder(
+                settings.recorder, lambda directory: self._open_segment(directory, settings, mount)
+            )
         except BaseException:
             self._lidar.close()
             raise
@@ -104,8 +106,8 @@ class Daemon:
         self._announcer, self._endurance = Announcer(), Endurance()
         self._keep_free_bytes = settings.recorder.min_free_mb << 20
 
-    def _open_segment(self, settings: SwathdConfig, mount: Mount) -> Segment:
-        path = logfolder.next_segment_path(self._directory, self._boot_id)
+    def _open_segment(self, directory: Path, settings: SwathdConfig, mount: Mount) -> Segment:
+        path = logfolder.next_segment_path(directory, self._boot_id)
         now = read_clocks()
         boottime_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         clock = HostClock(self._log_time.at(now), now.realtime_ns, now.monotonic_ns, boottime_ns)
@@ -299,7 +301,10 @@ class Daemon:
         assert self._recorder is not None
         counts, backlog = self._recorder.counts, self._recorder.backlog
         leftover = self._salvager.counts
-        free_bytes = logfolder.free_bytes(self._directory)
+        try:
+            free_bytes = logfolder.free_bytes(Path(counts.directory or self._directory))
+        except OSError:  # the folder is gone; the recorder says so
+            free_bytes = 0
         return RecorderStatus(
             segment=counts.segment,
             messages=counts.messages,
@@ -314,6 +319,8 @@ class Daemon:
             space=counts.space.value,
             refused_for_space=counts.refused_for_space,
             lost_on_disk=counts.lost_on_disk,
+            trouble=counts.trouble,
+            abandoned=counts.abandoned,
             leftovers=leftover.found,
             leftovers_mended=leftover.mended,
             leftovers_left=leftover.left,

@@ -213,7 +213,7 @@ class ParameterLink:
                 raise UsageError(
                     f"{self._device}: the autopilot is not heard any more; parameters are set only while it is"
                 )
-        if self._life.armed:
+        if self._life.armed(self._log_time.at(read_clocks())) is not False:
             raise UsageError(f"{self._device}: the autopilot is armed; parameters are set only while it is disarmed")
 
     def _set(self, name: str, value: float) -> None:
