@@ -50,6 +50,35 @@ _END_S: Final = 60.0
 """How long a worker may take to end: a slow disk gets the time to take what is in the backlog."""
 
 
+class Landing:
+    """Tells a landing from an autopilot, or a stranger, that flips between armed and disarmed.
+
+    Landed is who stays disarmed for `DISARMED_S`; and nobody lands again within `APART_S`.
+    """
+
+    DISARMED_S: Final = 5.0
+    APART_S: Final = 30.0
+
+    def __init__(self) -> None:
+        self._was_armed = False
+        self._since_ns: int | None = None
+        self._landed_ns: int | None = None
+
+    def look(self, is_armed: bool | None, now_ns: int) -> bool:
+        """Take what is known now, None where nothing is; whether the aircraft has just landed."""
+        if is_armed is not False:
+            self._was_armed |= bool(is_armed)
+            self._since_ns = None
+            return False
+        self._since_ns = now_ns if self._since_ns is None else self._since_ns
+        if not self._was_armed or now_ns - self._since_ns < self.DISARMED_S * NS_PER_S:
+            return False
+        if self._landed_ns is not None and now_ns - self._landed_ns < self.APART_S * NS_PER_S:
+            return False
+        self._was_armed, self._landed_ns = False, now_ns
+        return True
+
+
 class Daemon:
     """The running whole.
 
@@ -78,7 +107,7 @@ class Daemon:
         self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
         self._stop = stop
         self._status_trouble = False
-        self._was_armed = False
+        self._landing = Landing()
         self._links: dict[str, Link] = {}
         self._relay: Relay | None = None
 
@@ -223,10 +252,8 @@ class Daemon:
     def _note_landing(self, is_armed: bool | None) -> None:
         """A flight ends with its disarming: its segment is closed then, so that it can be pulled."""
         assert self._recorder is not None
-        if is_armed is False and self._was_armed:
+        if self._landing.look(is_armed, time.monotonic_ns()):
             self._recorder.rotate()
-        if is_armed is not None:
-            self._was_armed = is_armed
 
     def _clock_syncs(self, clock: HostClock) -> list[ClockSync]:
         """How the devices' clocks stand to log time, also for the log."""

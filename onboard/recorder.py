@@ -46,6 +46,7 @@ _RETRY_NS: Final = 5 * NS_PER_S
 """Between two attempts to open a segment on a full disk."""
 _TROUBLE_NS: Final = NS_PER_S
 """Between two attempts on a disk that fails."""
+_CLOSER_TICK_S: Final = 0.2
 _LIDAR: Final = frozenset((records.LIDAR.topic, records.POSITION.topic))
 """What is not recorded when space is low."""
 
@@ -149,6 +150,7 @@ class Recorder(Worker):
         self._retry_ns = 0
         self._told_drops = 0
         self._segment: Segment | None = None
+        self._closer: threading.Thread | None = None
         self._taken: deque[_Item] = deque()
         self._sync_soon = False
         self.backlog = Backlog(config.backlog_mb << 20)
@@ -210,9 +212,10 @@ class Recorder(Worker):
         self._look_at_space()
         if self.counts.space is Space.FULL:
             self._close_segment()
-        elif self._segment is None or self._rotation_due(self._segment):
-            self._close_segment()
+        elif self._segment is None:
             self._begin_segment()
+        elif self._rotation_due(self._segment):
+            self._rotate()
 
     def _write_until(self, end_ns: int | None) -> None:
         """Write the backlog; not beyond a time of the monotonic clock [ns] even if more and more comes."""
@@ -244,6 +247,25 @@ class Recorder(Worker):
         self.counts.slowest_sync_ms = max(self.counts.slowest_sync_ms, took_ms)
 
     # Segments -----------------------------------------------------------------------------------------------------
+
+    def _rotate(self) -> None:
+        """Go on in a new segment, and close the old one beside the recording.
+
+        Closing takes four syncs or more. Were they waited for, a power cut meanwhile would cost what came since the sync before.
+        """
+        old, self._segment = self._segment, None
+        drops, self._told_drops = self._drops() - self._told_drops, self._drops()
+        self._begin_segment()
+        self._closed()
+        self._closer = threading.Thread(target=self._close, args=(old, drops), name="closer", daemon=True)
+        self._closer.start()
+
+    def _closed(self) -> None:
+        """Wait for the segment before, if it is still being closed."""
+        while self._closer is not None and self._closer.is_alive():
+            self.progress()
+            self._closer.join(_CLOSER_TICK_S)
+        self._closer = None
 
     def _rotation_due(self, segment: Segment) -> bool:
         large = segment.size >= self._config.segment_mb << 20
@@ -316,11 +338,15 @@ class Recorder(Worker):
                 segment.abandon()
 
     def _close_segment(self) -> None:
+        self._closed()
         segment, self._segment = self._segment, None
-        if segment is None:
-            return
+        if segment is not None:
+            self._close(segment, self._drops() - self._told_drops)
+
+    def _close(self, segment: Segment, drops: int) -> None:
+        """Close a segment that nothing is written to any more; the closer's work too."""
         try:
-            segment.close({"refused": self._drops() - self._told_drops})
+            segment.close({"refused": drops})
             _log.info("closed %s", segment.path, extra=event("closed", segment=segment.path.name))
         except OSError as error:
             reason = "on a full disk" if _is_full(error) else f"({error.strerror})"

@@ -83,7 +83,7 @@ def test_a_full_backlog_refuses_at_once_and_keeps_room_for_small_messages() -> N
 
 
 def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_the_end(tmp_path: Path) -> None:
-    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=100), lambda: segment(tmp_path / "a.mcap"))
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=100), lambda _: segment(tmp_path / "a.mcap"))
     recorder.start()
     assert recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, b"one")], "ins"), True)
     time.sleep(0.4)
@@ -101,7 +101,7 @@ def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_th
 
 
 def test_a_sync_follows_what_was_handed_over_when_it_is_nearly_due_and_no_sooner(tmp_path: Path) -> None:
-    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=4000), lambda: segment(tmp_path / "a.mcap"))
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=4000), lambda _: segment(tmp_path / "a.mcap"))
     recorder.start()
     for wait_s, syncs in ((0.1, 0), (3.55, 1)):  # of 4 s, seven eighths are near
         time.sleep(wait_s)
