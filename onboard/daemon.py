@@ -369,4 +369,7 @@ def run(settings: SwathdConfig, config_path: Path) -> None:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
+    signal.signal(
+        signal.SIGHUP, signal.SIG_IGN
+    )  # nothing can be read anew in flight, and a terminal that closes ends no recording
     Daemon(settings, config_path, stop).run()
