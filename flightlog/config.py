@@ -9,7 +9,7 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 import yaml
 
@@ -31,7 +31,7 @@ class _Loader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):  # a few lines of aliases of aliases make gigabytes
             raise yaml.composer.ComposerError(
                 problem="an alias (*) stands there, which is not taken; write the value out",
-                problem_mark=self.peek_event().start_mark,
+                problem_mark=cast(Any, self).peek_event().start_mark,  # untyped in the stubs
             )
         return super().compose_node(parent, index)
 
