@@ -11,7 +11,11 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.errors import LogError
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.inertial.readings import read
+from groundproc.estimation.inertial.solution import Solution, solve
+from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     COMPASS,
     COURSE,
@@ -21,10 +25,6 @@ from groundproc.estimation.inertial.model import (
     GYRO_MATRIX,
     POSITION,
 )
-from groundproc.estimation.inertial.readings import read
-from groundproc.estimation.inertial.solution import Solution, solve
-from groundproc.estimation.ins import PositionFixes
-from groundproc.estimation.method import Estimate, Given, Progress
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg
@@ -105,7 +105,7 @@ def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[Ou
         mat_ins_lidar=leg.sync.mat_ins_lidar,
         outside=outside,
     )
-    return solve(readings)
+    return solve(readings, given=given, leg=leg)
 
 
 def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:

@@ -23,10 +23,21 @@ import importlib
 from types import ModuleType
 from typing import Any, Final
 
+from groundproc.estimation.observations.measured import Heard, Measured
 from groundproc.estimation.observations.observation import Flown, Observation
 
 KINDS: Final[dict[str, str]] = {
-    name: f"{__name__}.{name}" for name in ("fixes", "inertial", "attitudes", "outside", "control")
+    name: f"{__name__}.{name}"
+    for name in (
+        "fixes",
+        "inertial",
+        "attitudes",
+        "outside",
+        "control",
+        "barometer",
+        "standing",
+        "course",
+    )
 }
 """Module of each kind, imported when it is asked for; unknowns and rows stand in this order."""
 
@@ -34,6 +45,11 @@ KINDS: Final[dict[str, str]] = {
 def observations_of(flown: Flown) -> list[Observation]:
     """All that the adjustment of a run goes by besides the lidar's planes."""
     return [each for module in _modules("of_run") for each in module.of_run(flown)]
+
+
+def measured_of(heard: Heard) -> list[Measured]:
+    """All that the smoother of a leg goes by besides the inertial sensors, which carry its states from node to node."""
+    return [each for module in _modules("of_leg") for each in module.of_leg(heard)]
 
 
 def _modules(function: str) -> list[ModuleType]:
