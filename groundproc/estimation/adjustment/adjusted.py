@@ -35,7 +35,7 @@ from groundproc.estimation.observations.attitudes import ATTITUDE_SIGMA_RAD, att
 from groundproc.estimation.observations.fixes import SLID, SLID_SIGMAS, position_track
 from groundproc.estimation.observations.lasers import Corrections
 from groundproc.estimation.observations.lidar import plane_warnings
-from groundproc.estimation.observations.observation import Flown, Outcome
+from groundproc.estimation.observations.observation import Flown, Observation, Outcome
 from groundproc.estimation.observations.rows import H, turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
@@ -52,7 +52,7 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 Array = npt.NDArray[np.float64]
 
 
-def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
+def estimate(given: Given, progress: Progress, start: Trajectory, more: Sequence[Observation] = ()) -> Estimate:
     """Adjust every run of the lidar's clock.
 
     Parameters
@@ -61,6 +61,9 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     progress : Progress
     start : Trajectory
         Rough poses of the ins frame over the flight.
+    more : sequence of Observation
+        From elsewhere, beside those of the log and of the survey: poses of images, steps of another odometry. Not used where the
+        survey asks for nothing of the future.
 
     Raises
     ------
@@ -69,7 +72,7 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     """
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
-    adjust = causal_run if given.survey.causal else adjust_run
+    adjust = causal_run if given.survey.causal else functools.partial(adjust_run, more=more)
     for number in sorted({leg.run for leg in given.placed}):
         legs = [leg for leg in given.placed if leg.run == number]
         try:
@@ -409,15 +412,16 @@ def adjust_run(
     start: Trajectory,
     progress: Progress,
     exact: tuple[str, ...] = (),
+    more: Sequence[Observation] = (),
 ) -> Run:
     """Adjust one run of the lidar's clock, window by window as the odometry goes on: the memory is that of a window.
 
-    `exact` names globals whose covariance is wanted exactly.
+    `exact` names globals whose covariance is wanted exactly; `more` are observations of neither the log nor the survey.
     """
     motion, own, other = base_motion(given, max(legs, key=lambda leg: leg.sync.samples), given.flight.runs[number])
     units = {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None}
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    observations = observations_of(Flown(given, legs, units))
+    observations = [*observations_of(Flown(given, legs, units)), *more]
     sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
     tracker = Tracker(
         motion, start, mat, lever, gyro_offset(motion, own, other), position_track(given, legs[0]),
