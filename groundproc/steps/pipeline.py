@@ -8,30 +8,33 @@ import functools
 import itertools
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
+from flightlog.mount import Mount
 from groundproc import geodesy
 from groundproc.cloud.placing import write_cloud
 from groundproc.estimation import methods
-from groundproc.estimation.method import Estimate, Progress, chosen_table, gather
+from groundproc.estimation.method import Progress, chosen_corrections, gather
 from groundproc.files import made_folder, written_aside
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
-from groundproc.flight.timeline import legs
+from groundproc.flight.timeline import legs, tied
 from groundproc.products.pictures import draw_cloud
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.steps.quality import describe
 from groundproc.survey import Survey
-from groundproc.trajectory.table import read_trajectory, write_trajectory
+from groundproc.trajectory.estimate import TRAJECTORY, Estimate, is_estimate, read_estimate, write_estimate
+from groundproc.trajectory.table import read_trajectory
 
 
 def process(
     logs: Sequence[Path], survey: Survey, folder: Path, progress: Progress, poses: Path | None = None
 ) -> dict[str, Any]:
-    """Make cloud.laz, trajectory.csv, quality.json and pictures of a flight.
+    """Make cloud.laz, the files of the estimate, quality.json and pictures of a flight.
 
     Parameters
     ----------
@@ -42,7 +45,7 @@ def process(
         Made where it is not there.
     progress : Progress
     poses : Path, optional
-        A trajectory.csv from elsewhere, in UTC, to place the points with in place of the autopilot's.
+        A trajectory made before, in UTC, to place the points with: an estimate's folder or a trajectory.csv.
 
     Returns
     -------
@@ -51,7 +54,6 @@ def process(
     """
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)  # a wrong code is said before the work, not after
-    lasers = chosen_table(survey)
     if poses is None:
         methods.check(survey)
     elif survey.lasers == ESTIMATE:
@@ -64,9 +66,10 @@ def process(
         flight = read_flight(readers, "ins", functools.partial(progress, "read"))
         timeline = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), survey.sync)
         if poses is None:
-            made = methods.estimate(gather(readers, flight, timeline, mount, survey), progress)
+            made = methods.estimate(gather(readers, flight, timeline, mount, survey, mount_source), progress)
         else:
-            made = Estimate(read_trajectory(poses), mount, f"as {poses} has them", lasers, method="outside")
+            made = from_elsewhere(poses, survey, mount, mount_source)
+            timeline = tied(timeline, made.ties) if made.ties else timeline
         trajectory = made.trajectory
         frame = trajectory.frame
         code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
@@ -74,14 +77,46 @@ def process(
         tally, sample = write_cloud(
             readers, timeline, made, survey, projection, folder, functools.partial(progress, "place")
         )
-        write_trajectory(folder / "trajectory.csv", trajectory)
+        write_estimate(folder, made)
         for write in made.products:
             write(folder)
         draw_cloud(folder, sample, projection.crs.name)
-        quality = describe(readers, survey, made, mount_source, flight, timeline, projection, tally)
+        quality = describe(readers, survey, made, flight, timeline, projection, tally)
         with written_aside(folder / "quality.json") as aside:
             aside.write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
     return quality
+
+
+def from_elsewhere(place: Path, survey: Survey, mount: Mount, mount_source: str) -> Estimate:
+    """A trajectory made before, with what lies beside it; mount and lasers that the survey names go before those.
+
+    Parameters
+    ----------
+    place : Path
+        Folder of an estimate or its trajectory.csv; or a trajectory.csv that lies alone, which is taken with `mount`.
+
+    Raises
+    ------
+    LogError, ConfigError
+        It cannot be read.
+    """
+    folder = place if place.is_dir() else place.parent
+    if place.is_dir() or (place.name == TRAJECTORY and is_estimate(folder)):
+        made = read_estimate(folder)
+        made = replace(made, note="; ".join(filter(None, (made.note, f"read from {folder}"))))
+    else:
+        note = f"{place} lies alone: mount, lasers and clocks are those of the log and the survey"
+        made = Estimate(
+            read_trajectory(place),
+            mount,
+            f"as {place} has them",
+            method="outside",
+            mount_source=mount_source,
+            note=note,
+        )
+    if survey.mount is not None:
+        made = replace(made, mount=mount, mount_source=mount_source, mount_sigma=None)
+    return made if survey.lasers is None else replace(made, corrections=chosen_corrections(survey))
 
 
 def check_order(readers: list[LogReader]) -> None:

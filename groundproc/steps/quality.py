@@ -14,17 +14,16 @@ from flightlog.logfile import LogReader
 from groundproc import geodesy
 from groundproc.cloud.placing import Tally
 from groundproc.estimation import ins
-from groundproc.estimation.method import Estimate
 from groundproc.flight.flight import Flight
 from groundproc.flight.timeline import Leg
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 
 def describe(
     readers: Sequence[LogReader],
     survey: Survey,
     made: Estimate,
-    mount_source: str,
     flight: Flight,
     timeline: Sequence[Leg],
     projection: geodesy.Projection,
@@ -38,7 +37,7 @@ def describe(
         "software": {"swath": __version__, "log_format": FORMAT_VERSION},
         "inputs": [describe_log(reader) for reader in readers],
         "config": config.to_mapping(survey),
-        "mount": config.to_mapping(made.mount) | {"source": mount_source},
+        "mount": config.to_mapping(made.mount) | describe_mount(made),
         "local_frame": {
             "latitude_deg": frame.latitude_deg,
             "longitude_deg": frame.longitude_deg,
@@ -82,6 +81,20 @@ def describe(
         },
         "points": {"written": tally.written, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(tally.dropped)},
     }
+
+
+def describe_mount(made: Estimate) -> dict[str, Any]:
+    """Where the mount that was used comes from, and how well it is known where it was estimated."""
+    sigma = made.mount_sigma
+    stated = (
+        None
+        if sigma is None
+        else {
+            "turn_deg": np.rad2deg(sigma.turn_rad).tolist(),
+            "position_m": list(sigma.position_m),
+        }
+    )
+    return {"source": made.mount_source, "sigma": stated}
 
 
 def describe_log(reader: LogReader) -> dict[str, Any]:
