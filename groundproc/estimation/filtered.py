@@ -29,6 +29,7 @@ from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
+from groundproc.trajectory.covariance import SIZE, correlation_of, mat_attitude_turn
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
 
@@ -110,10 +111,12 @@ def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[Ou
 
 
 def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
-    """The trajectory of a solution, with its sigmas; `frame` is that of its readings."""
-    position, attitude = sigmas(solution)
+    """The trajectory of a solution, with the covariance of its poses; `frame` is that of its readings."""
+    covariance = pose_covariance(solution)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     kept_s = (solution.kept_ns - solution.time_ns[0]) * 1e-9
     nodes_s = (solution.time_ns - solution.time_ns[0]) * 1e-9
+    at_nodes = np.stack([np.interp(nodes_s, kept_s, column) for column in sigma.T], axis=1)
     return Trajectory(
         frame=frame,
         time_ns=solution.time_ns,
@@ -121,33 +124,23 @@ def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
         velocity_m_s=solution.velocity_m_s,
         quat_local_ins_wxyz=solution.quat,
         rate_rad_s=solution.rate_rad_s,
-        sigma_position_m=np.stack([np.interp(nodes_s, kept_s, axis) for axis in position.T], axis=1),
-        sigma_attitude_rad=np.stack([np.interp(nodes_s, kept_s, axis) for axis in attitude.T], axis=1),
+        sigma_position_m=at_nodes[:, :3],
+        sigma_attitude_rad=at_nodes[:, 3:],
         covered=solution.covered,
+        correlation=correlation_of(solution.kept_ns, covariance),
     )
 
 
-def sigmas(solution: Solution) -> tuple[Array, Array]:
-    """Sigma east, north, up [m] and of roll, pitch, heading [rad] at the kept times, shape (k, 3) each."""
-    covariance = solution.covariance
-    place = slice(POSITION, POSITION + 3)
-    position = np.sqrt(np.diagonal(covariance[:, place, place], axis1=1, axis2=2).astype(np.float64))
-    turn = slice(ATTITUDE, ATTITUDE + 3)
+def pose_covariance(solution: Solution) -> Array:
+    """Covariance of east, north, up [m], roll, pitch, heading [rad] at the kept times, shape (k, 6, 6)."""
     row = np.searchsorted(solution.time_ns, solution.kept_ns)
     heading, pitch, _ = frames.attitude_of(frames.mat_from_quat(solution.quat[row]))
+    states = np.r_[POSITION : POSITION + 3, ATTITUDE : ATTITUDE + 3]
+    covariance = solution.covariance[:, states[:, None], states].astype(np.float64)
     # a small turn in the local frame as changes of roll, pitch, heading
-    sine, cosine, tangent, secant = np.sin(heading), np.cos(heading), np.tan(pitch), 1.0 / np.cos(pitch)
-    zero, one = np.zeros_like(sine), np.ones_like(sine)
-    turned = np.stack(
-        [
-            np.stack([sine * secant, cosine * secant, zero], axis=1),
-            np.stack([cosine, -sine, zero], axis=1),
-            np.stack([sine * tangent, cosine * tangent, -one], axis=1),
-        ],
-        axis=1,
-    )
-    spread = turned @ covariance[:, turn, turn].astype(np.float64) @ np.swapaxes(turned, 1, 2)
-    return position, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    to_angles = np.tile(np.eye(SIZE), (len(row), 1, 1))
+    to_angles[:, 3:, 3:] = mat_attitude_turn(heading, pitch)
+    return np.asarray(to_angles @ covariance @ np.swapaxes(to_angles, 1, 2))
 
 
 def report(solution: Solution) -> dict[str, Any]:

@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from flightlog import records
 from flightlog.logfile import LogReader, LogWriter
 from groundproc.cli import main
+from groundproc.trajectory.estimate import FILES
 
 Array = npt.NDArray[np.float64]
-PRODUCTS = {"cloud.laz", "trajectory.csv", "quality.json", "cloud_height.png", "cloud_intensity.png"}
+PRODUCTS = {"cloud.laz", "quality.json", "cloud_height.png", "cloud_intensity.png", *FILES}
 RANGE_NOISE_M = 0.015
 """What the simulation puts into every range (1 sigma)."""
 LEAP_S = 18

@@ -6,7 +6,7 @@ packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, 
 import functools
 import pathlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -50,6 +50,7 @@ from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections
+from groundproc.trajectory.covariance import Correlation, correlation_of, scaled
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
 
@@ -196,14 +197,20 @@ class Run:
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""
-        position = np.concatenate([w.sigma_position_m[: w.own + (w is self.windows[-1])] for w in self.windows])
-        attitude = np.concatenate([w.sigma_attitude_rad[: w.own + (w is self.windows[-1])] for w in self.windows])
+        position, attitude, correlation = (
+            np.concatenate([getattr(w, name)[: w.own + (w is self.windows[-1])] for w in self.windows])
+            for name in ("sigma_position_m", "sigma_attitude_rad", "correlation")
+        )
         if self.joined is not None:
-            position = np.hypot(position, self.joined.sigma_position_m[: len(position)])
-            attitude = np.hypot(attitude, self.joined.sigma_attitude_rad[: len(attitude)])
+            count = len(position)
+            whole = self.joined.sigma_position_m[:count], self.joined.sigma_attitude_rad[:count]
+            covariance = scaled(correlation, position, attitude) + scaled(self.joined.correlation[:count], *whole)
+            position, attitude = np.hypot(position, whole[0]), np.hypot(attitude, whole[1])
+            correlation = correlation_of(np.arange(count), covariance).matrix
         grid, knots = np.arange(len(self.path.quat)), np.arange(len(position)) * STEPS
         sigmas = (np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (position, attitude))
-        return of_ins(self.path, self.motion, given.frame, mount, *sigmas)
+        made = of_ins(self.path, self.motion, given.frame, mount, *sigmas)
+        return replace(made, correlation=Correlation(made.time_ns[knots], correlation))
 
     def warnings(self) -> list[str]:
         """What the self-check found, a sentence each."""

@@ -27,6 +27,7 @@ from groundproc.estimation.adjustment.noise import noise_of
 from groundproc.estimation.adjustment.outside import Outside, outside_factors
 from groundproc.estimation.adjustment.patches import Patches, coarse
 from groundproc.estimation.adjustment.planes import Rows, placed, rows_of
+from groundproc.estimation.adjustment.poses import pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, whole_covariance
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.odometry.clusters import Clusters
@@ -34,6 +35,7 @@ from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path, basis
 from groundproc.estimation.odometry.stated import Attitudes, Positions
 from groundproc.flight.control import ControlPoint
+from groundproc.trajectory.covariance import SIZE, Correlation
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -54,6 +56,8 @@ LEAST_TURN: Final = np.deg2rad(0.0005)
 LEAST_SHIFT_M: Final = 0.0003
 """Of a window's shape no more is claimed, per root second."""
 LEAST_TILT: Final = np.deg2rad(0.003)
+SMOOTH_DRAWS: Final = 5
+"""Knots over which correlations of what is drawn are averaged: ten seconds."""
 TILT_TAU_S: Final = 240.0
 """The tilt of a path against gravity is that of the accelerometers' biases as a window knows them."""
 
@@ -225,28 +229,32 @@ class Joining:
         knots = slice(None, None, STEPS)
         mats, place = frames.mat_from_quat(self.path.quat[knots]), self.path.position_m[knots]
         names = unknowns.names
-        heading = frames.attitude_of(mats @ self.mat_sensor_ins)[0]
+        heading, pitch, _ = frames.attitude_of(mats @ self.mat_sensor_ins)
 
         def poses(x: Array) -> Array:
-            """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+            """Errors of position, and turns about the levelled axes forward, right, up, shape (n, 6)."""
             rotation, moved = _at_knots(x[: unknowns.path_size], mats)
             whole = x[names["world.turn"]]
             turn = rotation + whole
             forward = turn[:, 0] * np.sin(heading) + turn[:, 1] * np.cos(heading)
             right = turn[:, 0] * np.cos(heading) - turn[:, 1] * np.sin(heading)
             position = moved + np.cross(whole, place) + x[names["world.shift"]]
-            return np.stack([position, np.stack([forward, right, turn[:, 2]], axis=1)])
+            return np.column_stack([position, forward, right, turn[:, 2]])
 
+        errors = pose_errors(spread, poses, pitch, smooth=1, smooth_draws=SMOOTH_DRAWS)
         at = np.arange(len(self.begin.quat)) / STEPS
         sigmas = [
             np.stack([np.interp(at, np.arange(len(mats)), axis) for axis in part.T], axis=1)
-            for part in np.sqrt(spread.variance(poses))
+            for part in (errors.sigma_position_m, errors.sigma_attitude_rad)
         ]
+        correlation = Correlation(np.arange(len(mats)) * STEPS, errors.correlation).at(np.arange(len(self.begin.quat)))
         sigma_compass = np.sqrt(spread.variance(operator.itemgetter(names["compass"])))
         told: list[dict[str, Any]] = []
         if self.held is not None and self.control_clusters is not None:
             told = self.held.report(self.control_clusters, self.path)
-        return Joined(self.begin, self.path, sigmas[0], sigmas[1], (self.compass, sigma_compass), self.log, told)
+        return Joined(
+            self.begin, self.path, sigmas[0], sigmas[1], (self.compass, sigma_compass), self.log, told, correlation
+        )
 
 
 @dataclass(slots=True)
@@ -264,6 +272,8 @@ class Joined:
     log : list of dict
     control : list of dict
         What is to be said of each control point; empty where none was met.
+    correlation : ndarray, shape (slices + 1 or more, 6, 6)
+        Of the errors of position and attitude at slice boundaries.
     """
 
     begin: Path
@@ -273,6 +283,7 @@ class Joined:
     compass: tuple[Array, Array]
     log: list[dict[str, float]]
     control: list[dict[str, Any]] = field(default_factory=list)
+    correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
 
     def applied(self, path: Path) -> Path:
         """The path that was begun with, on its fine grid, as corrected."""
