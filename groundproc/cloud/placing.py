@@ -14,7 +14,6 @@ from flightlog.logfile import LogReader
 from groundproc import geodesy
 from groundproc.cloud import georeference, las
 from groundproc.cloud.points import Dropped, Points
-from groundproc.estimation.method import Estimate
 from groundproc.files import written_aside
 from groundproc.flight import load
 from groundproc.flight.timeline import Leg
@@ -23,6 +22,7 @@ from groundproc.sensors import hdl32e as decode
 from groundproc.sensors import identity as sensor_model
 from groundproc.sensors.hdl32e import Gate
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 CHUNK_PACKETS: Final = 1808
 """Packets placed at a time, a second's worth: bounds the memory, and is long enough for both cores to compress."""

@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trajectory",
         type=Path,
-        metavar="CSV",
-        help="poses from elsewhere, in place of an estimate; with what lies beside them of one of ours",
+        metavar="DIR|CSV",
+        help="a trajectory made before: a folder of `swath process`, whose mount, lasers and clocks are used too, or a trajectory.csv",
     )
     parser.add_argument("--until", choices=ORDER, metavar="STEP", help=f"stop after this step: {', '.join(ORDER)}")
     parser.add_argument("--status", action="store_true", help="say what is there and what is to be done, and why")
@@ -141,10 +141,22 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
         + (f"; {sync['note']}" if sync["note"] else ""),
         *_control_lines(quality.get(track["method"], {}).get("control")),
-        f"mount from {quality['mount']['source']}",
+        _mount_line(quality["mount"]),
         f"look at {folder / 'cloud_height.png'} and {folder / 'cloud_intensity.png'}; all figures are in {folder / 'quality.json'}",
     ]
     return "\n".join(lines)
+
+
+def _mount_line(mount: dict[str, Any]) -> str:
+    """Which mount was used, and how well it is known where it was estimated."""
+    source, sigma = mount["source"], mount["sigma"]
+    if not source.startswith("estimated"):
+        return f"mount from {source}"
+    lidar = mount["lidar"]
+    line = (
+        f"mount {source}: yaw {lidar['yaw_deg']:.3f}, pitch {lidar['pitch_deg']:.3f}, roll {lidar['roll_deg']:.3f} deg"
+    )
+    return line + (f", sigma {max(sigma['turn_deg']):.3f} deg at most" if sigma else "")
 
 
 def _control_lines(control: dict[str, Any] | None) -> list[str]:

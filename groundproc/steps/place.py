@@ -10,12 +10,12 @@ from typing import Any, Final
 from flightlog.hdl32e import RANGE_LSB_M
 from groundproc import geodesy
 from groundproc.cloud.placing import write_cloud
+from groundproc.flight.timeline import tied
 from groundproc.geodesy import LocalFrame
 from groundproc.products.pictures import draw_cloud
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.run import Run
 from groundproc.steps.step import Request, Step
-from groundproc.steps.trajectory import made_of
 from groundproc.survey import PlacingSettings, Survey, section
 
 FOUND: Final = f"{INSIDE}/place.json"
@@ -42,10 +42,11 @@ def projection_of(frame: LocalFrame, survey: Survey) -> geodesy.Projection:
 
 def work(run: Run, folder: Path) -> None:
     """Place the points and finish the products that are made of them."""
-    made = made_of(run)
+    made = run.estimate
+    timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
     projection = projection_of(made.trajectory.frame, run.survey)
     tally, sample = write_cloud(
-        run.readers, run.timeline, made, run.survey, projection, folder, functools.partial(run.progress, "place")
+        run.readers, timeline, made, run.survey, projection, folder, functools.partial(run.progress, "place")
     )
     draw_cloud(folder, sample, projection.crs.name)
     found = {

@@ -10,12 +10,11 @@ import numpy as np
 from flightlog import FORMAT_VERSION, __version__, config
 from flightlog.clock import utc_text
 from groundproc.estimation import ins
-from groundproc.estimation.method import Estimate
 from groundproc.steps import clocks, place
 from groundproc.steps.run import Run
 from groundproc.steps.step import Request, Step
-from groundproc.steps.trajectory import made_of
 from groundproc.survey import SECTIONS, Survey, section
+from groundproc.trajectory.estimate import Estimate
 
 
 def settings(request: Request) -> Mapping[str, Any]:
@@ -27,13 +26,11 @@ def work(run: Run, folder: Path) -> None:
     """Write quality.json."""
     tied = json.loads((run.folder / clocks.FOUND).read_text(encoding="utf-8"))
     placed = json.loads((run.folder / place.FOUND).read_text(encoding="utf-8"))
-    quality = describe(run.survey, made_of(run), run.mount_and_source[1], tied, placed)
+    quality = describe(run.survey, run.estimate, tied, placed)
     (folder / "quality.json").write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
 
 
-def describe(
-    survey: Survey, made: Estimate, mount_source: str, tied: dict[str, Any], placed: dict[str, Any]
-) -> dict[str, Any]:
+def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[str, Any]) -> dict[str, Any]:
     """What went in, what was dropped and why, and how well the clocks fit."""
     trajectory = made.trajectory
     frame = trajectory.frame
@@ -42,7 +39,7 @@ def describe(
         "software": {"swath": __version__, "log_format": FORMAT_VERSION},
         "inputs": tied["inputs"],
         "config": config.to_mapping(survey),
-        "mount": config.to_mapping(made.mount) | {"source": mount_source},
+        "mount": config.to_mapping(made.mount) | describe_mount(made),
         "local_frame": {
             "latitude_deg": frame.latitude_deg,
             "longitude_deg": frame.longitude_deg,
@@ -69,6 +66,15 @@ def describe(
         "lidar": placed["lidar"],
         "points": placed["points"],
     }
+
+
+def describe_mount(made: Estimate) -> dict[str, Any]:
+    """Where the mount that was used comes from, and how well it is known where it was estimated."""
+    sigma = made.mount_sigma
+    stated = None
+    if sigma is not None:
+        stated = {"turn_deg": np.rad2deg(sigma.turn_rad).tolist(), "position_m": list(sigma.position_m)}
+    return {"source": made.mount_source, "sigma": stated}
 
 
 STEP: Final = Step(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
@@ -18,6 +18,7 @@ from groundproc.flight.mounting import find_mount
 from groundproc.flight.timeline import Leg, legs
 from groundproc.steps.step import Request
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate, read_estimate
 
 
 class Run:
@@ -35,7 +36,6 @@ class Run:
         self.request = request
         self.folder = folder
         self.progress = progress
-        self.made: Any = None
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -73,6 +73,11 @@ class Run:
         """The flight's clocks on one scale."""
         mount, _ = self.mount_and_source
         return legs(self.flight.runs, self.flight.boots, mount.mat_ins_lidar(), self.survey.sync)
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """What step trajectory left, read from its files: a run that goes on places the points with the same as one that never stopped."""
+        return read_estimate(self.folder)
 
 
 def check_order(readers: list[LogReader]) -> None:

@@ -27,7 +27,7 @@ class Request:
     survey : Survey
         With the paths in it absolute or relative to the working directory.
     poses : Path or None
-        A trajectory.csv from elsewhere, to place the points with in place of an estimate.
+        A trajectory made before, to place the points with: an estimate's folder or a trajectory.csv.
     """
 
     logs: Sequence[Path]

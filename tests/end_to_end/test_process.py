@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from flightlog import records
 from flightlog.logfile import LogReader, LogWriter
 from groundproc.cli import main
+from groundproc.trajectory.estimate import FILES
 
 Array = npt.NDArray[np.float64]
 PRODUCTS = {"cloud.laz", "trajectory.csv", "quality.json", "cloud_height.png", "cloud_intensity.png"}
@@ -51,7 +52,7 @@ class Processed:
 def process(folder: Path, *words: Any, method: str = "ins") -> Processed:
     """Products by the autopilot's own solution where nothing else is said: these tests are about the chain."""
     assert main(["process", *(str(word) for word in words), "--method", method, "-o", str(folder)]) == 0
-    assert {path.name for path in folder.iterdir()} - {"adjustment.png"} == PRODUCTS | {LEDGER}
+    assert {path.name for path in folder.iterdir()} - {"adjustment.png"} == PRODUCTS | {LEDGER} | set(FILES)
     return Processed(folder)
 
 

@@ -81,7 +81,12 @@ def applied(trajectory: Trajectory, values: Array) -> Trajectory:
         trajectory.sigma_position_m,
         trajectory.sigma_attitude_rad,
     )
-    return replace(made, covered=made.covered & trajectory.covered, interpolation=trajectory.interpolation)
+    return replace(
+        made,
+        covered=made.covered & trajectory.covered,
+        interpolation=trajectory.interpolation,
+        correlation=trajectory.correlation,
+    )
 
 
 def write_trims(path: Path, trims: Trims) -> None:
