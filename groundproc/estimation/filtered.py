@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.errors import LogError
 from groundproc.estimation.inertial.model import (
     ATTITUDE,
     COMPASS,
@@ -24,14 +23,15 @@ from groundproc.estimation.inertial.model import (
 from groundproc.estimation.inertial.readings import read
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.ins import PositionFixes
-from groundproc.estimation.method import Given, Progress
+from groundproc.estimation.legs import leg_by_leg
+from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.covariance import SIZE, correlation_of, mat_attitude_turn
 from groundproc.trajectory.estimate import Estimate
-from groundproc.trajectory.trajectory import Trajectory, joined
+from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -60,30 +60,17 @@ def filtered_estimate(given: Given, progress: Progress, outside: Sequence[Outsid
     """
     del progress
     outside = [*outside, *surveyed(given)]
-    parts: list[Trajectory] = []
     reports: list[dict[str, Any]] = []
-    reasons: list[LogError] = []
     warnings: list[str] = []
-    placed = given.placed
-    for number, (leg, fix) in enumerate(zip(placed, given.fixes, strict=True)):
-        try:
-            solution = solve_leg(given, leg, fix, outside)
-        except LogError as error:
-            reasons.append(error)
-            continue
+
+    def of_leg(leg: Leg, fixes: PositionFixes) -> Trajectory:
+        solution = solve_leg(given, leg, fixes, outside)
         reports.append({"boot": leg.boot.number, "lidar_run": leg.run} | report(solution))
-        warnings += _warnings(solution)
-        part = trajectory_in(given.frame, solution)
-        # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
-        if number and placed[number - 1].boot is leg.boot and parts:
-            part = part.after(int(parts[-1].time_ns[-1]))
-        if number + 1 < len(placed) and placed[number + 1].boot is leg.boot:
-            part = part.before(int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]))
-        if len(part) > 1:
-            parts.append(part)
-    if reasons and not parts:
-        raise reasons[0]
-    return Estimate(joined(parts), given.mount, SIGMA_SOURCE, report={"legs": reports}, warning="; ".join(warnings))
+        warnings.extend(_warnings(solution))
+        return trajectory_in(given.frame, solution)
+
+    trajectory = leg_by_leg(given, of_leg)
+    return Estimate(trajectory, given.mount, SIGMA_SOURCE, report={"legs": reports}, warning="; ".join(warnings))
 
 
 def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[OutsideFixes] = ()) -> Solution:
@@ -190,3 +177,6 @@ def _warnings(solution: Solution) -> list[str]:
         return []
     moving = f"{solution.last_step_m:.2f} m and {np.rad2deg(solution.last_step_rad):.2f} deg"
     return [f"filtered: after {solution.iterations} iterations still moving by {moving}; expected to settle"]
+
+
+METHOD: Final = Method(filtered_estimate, options=("positions",))

@@ -37,7 +37,8 @@ from groundproc.estimation.adjustment.windows import (
     joined_path,
     whole_stiffness,
 )
-from groundproc.estimation.method import Given, Progress
+from groundproc.estimation.direct import ins_estimate
+from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack, Motion, base_motion, on_grid
@@ -51,7 +52,7 @@ from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections
 from groundproc.trajectory.covariance import Correlation, correlation_of, scaled
-from groundproc.trajectory.estimate import Estimate
+from groundproc.trajectory.estimate import Estimate, MountSigma
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
@@ -66,21 +67,15 @@ ATTITUDE_TAU_S: Final = 10.0
 """Of an AHRS of the APM class: tilt, and heading beyond the compass's curve; its errors last for the time of its own filter."""
 
 
-def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
-    """Adjust every run of the lidar's clock.
-
-    Parameters
-    ----------
-    given : Given
-    progress : Progress
-    start : Trajectory
-        Rough poses of the ins frame over the flight.
+def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
+    """Adjust every run of the lidar's clock, begun from the autopilot's solution.
 
     Raises
     ------
     LogError
         No run has lidar, inertial data and positions together.
     """
+    start = ins_estimate(given, progress).trajectory
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
     adjust = causal_run if given.survey.causal else adjust_run
@@ -104,6 +99,7 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
         main.SIGMA_SOURCE,
         main.lasers(given.corrections),
         mount_source=main.mount_source(given.mount_source),
+        mount_sigma=main.mount_sigma(given.mount),
         report=main.report(given.mount),
         warning="; ".join(warnings),
         products=(
@@ -172,9 +168,8 @@ class Run:
         lever = nominal.lidar_position_m()
         if "ins.lever" in values:
             lever = -mat @ values["ins.lever"][0]
-        x, y, z = (float(v) for v in lever)
         return nominal.with_lidar(
-            yaw_deg=(180.0 - heading) % 360.0 - 180.0, pitch_deg=pitch, roll_deg=roll, position_m=(x, y, z)
+            yaw_deg=(180.0 - heading) % 360.0 - 180.0, pitch_deg=pitch, roll_deg=roll, position_m=_three(lever)
         )
 
     def corrections(self) -> Corrections | None:
@@ -185,6 +180,17 @@ class Run:
     def mount_source(self, nominal: str) -> str:
         """Where the mount comes from; `nominal` is where that came from which it began with."""
         return f"estimated by adjusted, begun from {nominal}" if self.estimates_mount() else nominal
+
+    def mount_sigma(self, nominal: Mount) -> MountSigma | None:
+        """How well the mount is known: the turn about the sensor's axes, the lever arm in the ins frame."""
+        if not self.estimates_mount():
+            return None
+        values = self.estimates()
+        turn, lever = values["ins.turn"][1], None
+        if "ins.lever" in values:
+            square = np.square(self.mount(nominal).mat_ins_lidar()) @ np.square(values["ins.lever"][1])
+            lever = _three(np.sqrt(square))
+        return MountSigma(_three(turn), lever)
 
     def estimates_mount(self) -> bool:
         """Whether the mount is estimated: it is not without the autopilot's gyro, nor where what the run began from is used."""
@@ -417,6 +423,9 @@ class CausalRun:
         """The nominal mount's."""
         return nominal
 
+    def mount_sigma(self, nominal: Mount) -> None:
+        """Nothing is said of it."""
+
     def is_worse(self) -> bool:
         """It is what it is."""
         return False
@@ -435,6 +444,11 @@ class CausalRun:
             "median_matched": float(np.median(self.track.matched)),
             "median_residual_m": float(np.nanmedian(self.track.residual_m)),
         }
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 def own_part(start: Trajectory, run: Run | CausalRun) -> Trajectory:
@@ -643,3 +657,8 @@ def attitude_track(leg: Leg) -> Attitudes | None:
         return None
     _, time_ns, quat, _ = ins.attitudes(leg.boot)
     return Attitudes(leg.utc_from_boot(time_ns), quat, ATTITUDE_SIGMA_RAD, ATTITUDE_TAU_S)
+
+
+METHOD: Final = Method(
+    adjusted_estimate, options=("positions", "control", "causal"), finds_lasers=True, uses_points=True
+)

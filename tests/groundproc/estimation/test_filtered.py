@@ -17,7 +17,7 @@ from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame
 from flightlog.mount import Mount
-from groundproc.estimation import filtered, ins, methods
+from groundproc.estimation import direct, filtered, ins, methods
 from groundproc.estimation.inertial import readings
 from groundproc.estimation.inertial.model import ATTITUDE, GYRO_BIAS, POSITION
 from groundproc.estimation.inertial.solution import Solution, solve
@@ -113,7 +113,7 @@ class Flown:
 
 def fly(simulated: Any, change: Callable[[Flight], None] | None = None) -> Flown:
     with given_of(simulated.log, change) as given:
-        raw = methods.ins_estimate(given, quiet).trajectory
+        raw = direct.ins_estimate(given, quiet).trajectory
         estimate = filtered.filtered_estimate(given, quiet)
         solution = filtered.solve_leg(given, given.placed[0], given.fixes[0])
     assert estimate.warning == ""
