@@ -12,8 +12,10 @@ from matplotlib.ticker import FormatStrFormatter
 from matplotlib.transforms import Bbox
 
 from flightlog import frames
-from groundproc.estimation.adjustment.adjusted import CausalRun, Run, attitude_track, position_track
+from groundproc.estimation.adjustment.adjusted import CausalRun, Run
 from groundproc.estimation.method import Given
+from groundproc.estimation.observations.attitudes import attitude_track
+from groundproc.estimation.observations.fixes import position_track
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path as SensorPath
 from groundproc.estimation.odometry.stated import Attitudes, Positions

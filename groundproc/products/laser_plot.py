@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flightlog.hdl32e import ELEVATION_DEG
-from groundproc.estimation.adjustment.lasers import Corrections
+from groundproc.estimation.observations.lasers import Corrections
 from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.estimation.adjustment.factors import Unknowns
 from groundproc.estimation.adjustment.noise import Noise
 from groundproc.estimation.adjustment.solve import Problem
+from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
 

@@ -5,11 +5,11 @@ import numpy.typing as npt
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from groundproc.estimation.adjustment.factors import Factor, Unknowns
-from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Carrying, Noise, followed, lasting, noise_of
-from groundproc.estimation.adjustment.planes import rows_of
+from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Noise, followed, lasting, noise_of
 from groundproc.estimation.adjustment.posterior import Posterior
 from groundproc.estimation.adjustment.solve import Problem, problem
+from groundproc.estimation.observations.planes import rows_of
+from groundproc.estimation.observations.rows import Carrying, Errors, Factor, Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from tests.helpers.circling import INTERVALS, circle, factors_of, room, unknowns_of_whole
 
@@ -31,15 +31,15 @@ def posed(unknowns: Unknowns) -> tuple[Problem, Noise]:
     factors = factors_of(unknowns)
     turn = [6 * k + axis for k in range(1, INTERVALS + 1) for axis in range(3)]
     whole = factors[0]
-    gyro = Factor("lidar gyro", whole.residual[turn], whole.matrix[turn], whole.sigma[turn])
+    carrying = Carrying(np.arange(INTERVALS), 1e-3 / np.sqrt(STEPS))
+    gyro = Factor("lidar gyro", whole.residual[turn], whole.matrix[turn], whole.sigma[turn], carrying=carrying)
     force = [6 * k + 3 + axis for k in range(INTERVALS // 2) for axis in range(3)]
     residual = np.random.default_rng(5).normal(size=len(force)) * whole.sigma[force]
-    felt = Factor("ins accelerometer", residual, whole.matrix[force], whole.sigma[force])
+    felt = Factor("ins accelerometer", residual, whole.matrix[force], whole.sigma[force], errors=Errors.LASTING)
     factors = [gyro, felt, *factors]
     linear = problem(rows, factors, unknowns, DEFLATION, path)
     x, _ = linear.solve(-linear.gradient)
-    by = Carrying("lidar gyro", np.ones(INTERVALS, np.bool_), 1e-3 / np.sqrt(STEPS))
-    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x, by)
+    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x)
 
 
 def parts(noise: Noise, values: Array) -> list[Array]:

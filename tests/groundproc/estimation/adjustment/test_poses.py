@@ -7,9 +7,9 @@ import pytest
 from flightlog import frames
 from flightlog.mount import Mount
 from groundproc.estimation.adjustment import windows
-from groundproc.estimation.adjustment.factors import Unknowns
 from groundproc.estimation.adjustment.poses import pose_errors, semidefinite
 from groundproc.estimation.adjustment.posterior import Spread
+from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
 from tests.helpers.circling import INTERVALS, circle
