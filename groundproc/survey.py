@@ -1,7 +1,7 @@
 """survey.yaml: what a user chooses about a survey, with what is taken where he does not."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from flightlog.config import option
 from flightlog.mount import Mount
@@ -65,6 +65,11 @@ class Survey:
         "auto",
         "clock offset from the gyros, from receive times, or gyros with receive times as the fallback",
         choices=("auto", "gyro", "host"),
+    )
+    products: tuple[Any, ...] | None = option(
+        None,
+        "what is made, by name: [cloud.laz, trajectory.csv, quality.json], each with its own options where it has some; "
+        "null: all of docs/products.md",
     )
     fov_deg: tuple[float, float] = option(
         (255.0, 105.0), "azimuths kept, clockwise from first to second; [0, 360] keeps all", minimum=-360, maximum=360

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
+
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc import geodesy
@@ -74,8 +76,8 @@ class Estimate:
         What else there is to say; stands in quality.json under the method's name.
     warning : str
         One sentence where the self-check found something wrong; empty where all is well.
-    products : tuple of callable
-        Each is called with the folder of the products and writes files of the method's own into it.
+    figures : dict of str to ndarray
+        Arrays that pictures draw, by flat names such as "adjustment.slice_s".
     method : str
         Name of the method that made it.
     note : str
@@ -88,7 +90,7 @@ class Estimate:
     lasers: LaserTable = field(default_factory=LaserTable.nominal)
     report: dict[str, Any] = field(default_factory=dict)
     warning: str = ""
-    products: tuple[Callable[[Path], None], ...] = ()
+    figures: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
     method: str = ""
     note: str = ""
 

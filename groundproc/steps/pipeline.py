@@ -6,32 +6,33 @@ log --load--> packets, frames --timeline--> one time scale --trajectory--> poses
 import contextlib
 import functools
 import itertools
-import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
-from groundproc import geodesy
-from groundproc.cloud.placing import write_cloud
+from groundproc import geodesy, products
+from groundproc.cloud import placing
 from groundproc.estimation import methods
 from groundproc.estimation.method import Estimate, Progress, chosen_table, gather
-from groundproc.files import made_folder, written_aside
+from groundproc.files import made_folder
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
 from groundproc.flight.timeline import legs
-from groundproc.products.pictures import draw_cloud
+from groundproc.products.product import Context, Provenance, draw, streamed
+from groundproc.sensors.hdl32e import Gate
 from groundproc.sensors.lasers import ESTIMATE
-from groundproc.steps.quality import describe
+from groundproc.steps.quality import describe, describe_log
 from groundproc.survey import Survey
-from groundproc.trajectory.table import read_trajectory, write_trajectory
+from groundproc.trajectory.table import read_trajectory
 
 
 def process(
     logs: Sequence[Path], survey: Survey, folder: Path, progress: Progress, poses: Path | None = None
 ) -> dict[str, Any]:
-    """Make cloud.laz, trajectory.csv, quality.json and pictures of a flight.
+    """Make the products of a flight that the survey chose.
 
     Parameters
     ----------
@@ -51,6 +52,7 @@ def process(
     """
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)  # a wrong code is said before the work, not after
+    wanted = products.chosen(survey.products)
     lasers = chosen_table(survey)
     if poses is None:
         methods.check(survey)
@@ -71,16 +73,15 @@ def process(
         frame = trajectory.frame
         code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
         projection = geodesy.Projection(frame, geodesy.projected_crs(code))
-        tally, sample = write_cloud(
-            readers, timeline, made, survey, projection, folder, functools.partial(progress, "place")
-        )
-        write_trajectory(folder / "trajectory.csv", trajectory)
-        for write in made.products:
-            write(folder)
-        draw_cloud(folder, sample, projection.crs.name)
-        quality = describe(readers, survey, made, mount_source, flight, timeline, projection, tally)
-        with written_aside(folder / "quality.json") as aside:
-            aside.write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
+        provenance = Provenance(tuple(describe_log(reader) for reader in readers))
+        context = Context(folder, survey, made, projection, provenance)
+        tally = placing.Tally()
+        packets = placing.chunks(readers, timeline, tally, functools.partial(progress, "place"))
+        gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
+        with streamed(wanted, context) as sinks:
+            placed = placing.place(packets, trajectory, made.mount, projection, sinks, gate=gate, lasers=made.lasers)
+        quality = describe(readers, survey, made, mount_source, flight, timeline, projection, tally, placed)
+        draw(wanted, replace(context, quality=quality))
     return quality
 
 

@@ -12,7 +12,7 @@ from flightlog.constants import HOUR_NS
 from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from groundproc import geodesy
-from groundproc.cloud.placing import Tally
+from groundproc.cloud.placing import Placed, Tally
 from groundproc.estimation import ins
 from groundproc.estimation.method import Estimate
 from groundproc.flight.flight import Flight
@@ -29,6 +29,7 @@ def describe(
     timeline: Sequence[Leg],
     projection: geodesy.Projection,
     tally: Tally,
+    placed: Placed,
 ) -> dict[str, Any]:
     """What went in, what was dropped and why, and how well the clocks fit."""
     frame, trajectory = projection.frame, made.trajectory
@@ -80,7 +81,7 @@ def describe(
                 "rejected": tally.rejected,
             },
         },
-        "points": {"written": tally.written, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(tally.dropped)},
+        "points": {"written": placed.points, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(placed.dropped)},
     }
 
 
