@@ -115,11 +115,10 @@ class PlacingSettings:
 
     fov_deg: tuple[float, float] = setting(
         (255.0, 105.0),
-        "azimuths kept, clockwise from first to second, in degrees",
+        "azimuths kept, clockwise from first to second, in degrees; 0 and 360 keep all",
         words=("--fov",),
         metavar="A-B",
         reads="azimuths",
-        in_file="[0, 360] keeps all",
         minimum=-360,
         maximum=360,
     )
