@@ -38,7 +38,6 @@ from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
 from groundproc.cloud.georeference import georeference
 from groundproc.cloud.placing import Tally, chunks
 from groundproc.estimation import methods
-from groundproc.estimation.dynamic.options import ROBUST, SOURCE, DynamicOptions
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import Found, Search
 from groundproc.estimation.dynamic.trims import applied, interpolated
@@ -48,6 +47,7 @@ from groundproc.flight.mounting import find_mount
 from groundproc.flight.timeline import Leg, legs
 from groundproc.sensors.hdl32e import Gate
 from groundproc.survey import Survey
+from groundproc.survey.dynamic import ROBUST, SOURCE, DynamicOptions
 from groundproc.trajectory.trajectory import Trajectory
 
 mpl.use("Agg")

@@ -24,11 +24,12 @@ from groundproc.estimation.inertial.model import (
 from groundproc.estimation.inertial.readings import read
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.ins import PositionFixes
-from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.method import Given, Progress
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
+from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]

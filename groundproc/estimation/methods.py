@@ -10,9 +10,11 @@ from flightlog.errors import CoverageError, LogError, UsageError
 from groundproc.estimation import filtered, ins
 from groundproc.estimation.adjustment import adjusted
 from groundproc.estimation.dynamic import dynamic
-from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.method import Given, Progress
+from groundproc.flight.timeline import ties_of
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 
@@ -37,8 +39,14 @@ def estimate(given: Given, progress: Progress) -> Estimate:
                 raise
             reasons.append(f"not {name}, because {str(error).removeprefix(f'{name}: ')}")
             continue
-        lasers = made.lasers if given.survey.lasers == ESTIMATE else given.lasers
-        return replace(made, method=name, note="; ".join(reasons), lasers=lasers)
+        return replace(
+            made,
+            method=name,
+            note="; ".join(reasons),
+            corrections=made.corrections if given.survey.lasers == ESTIMATE else given.corrections,
+            ties=ties_of(given.timeline),
+            mount_source=made.mount_source or given.mount_source,
+        )
     raise AssertionError(f"no method for {given.survey.method}")
 
 

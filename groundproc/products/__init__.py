@@ -6,7 +6,7 @@ function is given. Modules are imported when a product is chosen, so that the co
 """
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -39,16 +39,16 @@ REGISTRY: Final[dict[str, Entry]] = {
     "pictures": Entry(
         "groundproc.products.pictures", "Pictures", "cloud_height.png, cloud_intensity.png: from above and from the south"
     ),
-    "trajectory.csv": Entry("groundproc.products.trajectory_table", "write", "poses with their sigmas"),
     "adjustment.png": Entry(
         "groundproc.products.adjustment_plot", "draw", "method adjusted: what it left over, and how well it knows what it estimated"
     ),
     "lasers.png": Entry("groundproc.products.laser_plot", "draw", "lasers: estimate: corrections of the single lasers"),
     "trims.csv": Entry("groundproc.products.trim_table", "write", "method dynamic: the trims of each revolution"),
     "trims.png": Entry("groundproc.products.trim_plot", "draw", "method dynamic: the trims over time"),
-    "quality.json": Entry("groundproc.products.quality_json", "write", "what went in, what was dropped and why, how well it fits"),
 }  # fmt: skip
 """All products by name, in the order in which they are made."""
+ALWAYS: Final = ("trajectory.csv", "quality.json")
+"""What the steps leave whatever is chosen; a survey may name them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +91,18 @@ def chosen(wanted: Sequence[Any] | None) -> list[Chosen]:
         wanted = [name for name, entry in REGISTRY.items() if entry.by_default]
     options: dict[str, Any] = {}
     for item in wanted:
+        if item in ALWAYS:
+            continue
         name, given = _read(item)
         if name in options:
             raise ConfigError(f"products: {name!r} stands there twice, expected once")
         options[name] = given
     return [_loaded(name, options[name]) for name in REGISTRY if name in options]
+
+
+def plain(products: Iterable[Chosen]) -> dict[str, Any]:
+    """Chosen products and their options as plain values by name: what decides whether they are to be made again."""
+    return {each.name: [config.to_mapping(options) for options in each.options] for each in products}
 
 
 def _read(item: Any) -> tuple[str, Any]:
@@ -105,7 +112,7 @@ def _read(item: Any) -> tuple[str, Any]:
     else:
         given = {}
     if not isinstance(item, str) or item not in REGISTRY:
-        raise ConfigError(f"products: {item!r} found, expected some of {', '.join(REGISTRY)}")
+        raise ConfigError(f"products: {item!r} found, expected some of {', '.join((*REGISTRY, *ALWAYS))}")
     return item, given
 
 

@@ -12,26 +12,11 @@ from flightlog import __version__
 from flightlog.errors import SourceError, SwathError
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import round_origin_m
-from groundproc.estimation.method import Estimate
 from groundproc.files import written_aside
 from groundproc.geodesy import Projection, with_sea_level
 from groundproc.products import Chosen
 from groundproc.survey import Survey
-
-
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """What a product is made of, and by what.
-
-    Attributes
-    ----------
-    inputs : tuple of dict
-        Logs, as `inputs` of quality.json.
-    software : str
-    """
-
-    inputs: tuple[dict[str, Any], ...]
-    software: str = f"swath {__version__}"
+from groundproc.trajectory.estimate import Estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,25 +26,32 @@ class Context:
     Attributes
     ----------
     folder : Path
-        Of the products.
+        To write into.
+    finished : Path
+        Where what was made before lies.
     survey : Survey
     estimate : Estimate
         Trajectory, mount, lasers; `figures` and `report` of the method.
     projection : Projection
         From the trajectory's local frame to coordinates of the points.
-    provenance : Provenance
     quality : dict
-        What quality.json holds; empty while points are placed.
+        What quality.json holds: inputs, versions, settings, figures. Empty while points are placed.
+    inputs : tuple of str
+        Names of the logs.
+    software : str
+        What makes it.
     kept : contextlib.ExitStack
         Of this product alone: what is entered here is left when the product is finished, or has failed.
     """
 
     folder: Path
+    finished: Path
     survey: Survey
     estimate: Estimate
     projection: Projection
-    provenance: Provenance
     quality: dict[str, Any] = field(default_factory=dict)
+    inputs: tuple[str, ...] = ()
+    software: str = f"swath {__version__}"
     kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property

@@ -36,7 +36,7 @@ from groundproc.estimation.adjustment.windows import (
     joined_path,
     whole_stiffness,
 )
-from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.method import Given, Progress
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack, Motion, base_motion, on_grid
@@ -48,8 +48,8 @@ from groundproc.estimation.surveyed import surveyed, surveyed_control
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
-from groundproc.sensors.hdl32e import LaserTable
-from groundproc.sensors.lasers import ESTIMATE
+from groundproc.sensors.lasers import ESTIMATE, LaserCorrections
+from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
@@ -90,7 +90,8 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
             reasons.append(error)
     if not made:
         raise reasons[0]
-    main = max(made, key=lambda run: len(run.path.quat))
+    # a run that is no better than its start tells nothing of the mount
+    main = max(made, key=lambda run: (not run.is_worse(), len(run.path.quat)))
     mount = main.mount(given.mount)
     warnings = [w for run in made for w in run.warnings()] + [str(reason) for reason in reasons]
     corrections = main.corrections()
@@ -99,7 +100,8 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
         trajectory,
         mount,
         main.SIGMA_SOURCE,
-        main.lasers(given.lasers),
+        main.lasers(given.corrections),
+        mount_source=main.mount_source(given.mount_source),
         report=main.report(given.mount),
         warning="; ".join(warnings),
         figures=_figures(main, given, trajectory) | ({} if corrections is None else corrections.figures(given.lasers)),
@@ -160,10 +162,10 @@ class Run:
         return found if self.joined is None else found | {"compass": self.joined.compass}
 
     def mount(self, nominal: Mount) -> Mount:
-        """The mount as estimated."""
-        values = self.estimates()
-        if "ins.turn" not in values:
+        """The mount as estimated; the nominal one where the trajectory is what the run began from, which was made with it."""
+        if not self.estimates_mount():
             return nominal
+        values = self.estimates()
         mat = nominal.mat_ins_lidar() @ turned(-values["ins.turn"][0])
         heading, pitch, roll = (float(np.rad2deg(a[0])) for a in frames.attitude_of(mat[None]))
         lever = nominal.lidar_position_m()
@@ -179,10 +181,18 @@ class Run:
         told = corrections_over(self.windows)
         return None if told is None else Corrections(*told)
 
-    def lasers(self, nominal: LaserTable) -> LaserTable:
-        """The lasers as estimated, or as they were given."""
+    def mount_source(self, nominal: str) -> str:
+        """Where the mount comes from; `nominal` is where that came from which it began with."""
+        return f"estimated by adjusted, begun from {nominal}" if self.estimates_mount() else nominal
+
+    def estimates_mount(self) -> bool:
+        """Whether the mount is estimated: it is not without the autopilot's gyro, nor where what the run began from is used."""
+        return "ins.turn" in self.windows[0].values and not self.is_worse()
+
+    def lasers(self, nominal: LaserCorrections) -> LaserCorrections:
+        """Corrections of the lasers as estimated, or as they were given."""
         found = self.corrections()
-        return nominal if found is None else found.file().table()
+        return nominal if found is None or self.is_worse() else found.file()
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""
@@ -392,8 +402,12 @@ class CausalRun:
     def corrections(self) -> None:
         """The lasers are taken as they are given."""
 
-    def lasers(self, nominal: LaserTable) -> LaserTable:
+    def lasers(self, nominal: LaserCorrections) -> LaserCorrections:
         """As they were given."""
+        return nominal
+
+    def mount_source(self, nominal: str) -> str:
+        """The nominal mount's."""
         return nominal
 
     def is_worse(self) -> bool:

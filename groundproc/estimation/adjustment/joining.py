@@ -20,21 +20,14 @@ from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from groundproc.estimation.adjustment.anchors import attitude_factor, fixes_name, position_factors
-from groundproc.estimation.adjustment.batch import (
-    COMPASS_PRIOR,
-    DEFLATION,
-    DRAWS,
-    Posterior,
-    Spread,
-    turned,
-    whole_covariance,
-)
+from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, DEFLATION, DRAWS, turned
 from groundproc.estimation.adjustment.control import Held, held_to
 from groundproc.estimation.adjustment.factors import Factor, H, RowBuilder, Unknowns, cross, eye, prior_factor, whitened
 from groundproc.estimation.adjustment.noise import noise_of
 from groundproc.estimation.adjustment.outside import Outside, outside_factors
 from groundproc.estimation.adjustment.patches import Patches, coarse
 from groundproc.estimation.adjustment.planes import Rows, placed, rows_of
+from groundproc.estimation.adjustment.posterior import Posterior, Spread, whole_covariance
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS

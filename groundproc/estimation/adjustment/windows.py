@@ -15,12 +15,13 @@ from scipy.ndimage import uniform_filter1d
 from flightlog import frames
 from groundproc.estimation.adjustment import lasers
 from groundproc.estimation.adjustment.anchors import Tie
-from groundproc.estimation.adjustment.batch import DRAWS, Batch, Posterior, Spread, joined, make_unit
+from groundproc.estimation.adjustment.batch import DRAWS, Batch, make_unit
 from groundproc.estimation.adjustment.control import kept_for, together
 from groundproc.estimation.adjustment.factors import H, Unknowns
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
 from groundproc.estimation.adjustment.outside import DELAY, Outside
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
+from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack, Motion

@@ -16,8 +16,9 @@ from scipy.stats import chi2
 from flightlog import frames
 from flightlog.mount import Mount
 from groundproc.estimation.adjustment import lasers
-from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, PRIORS, joined, turned
+from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, PRIORS, turned
 from groundproc.estimation.adjustment.lasers import Corrections
+from groundproc.estimation.adjustment.posterior import joined
 from groundproc.estimation.adjustment.windows import UNSEEN, Window, corrections_over
 from groundproc.estimation.calibration.compass import BINS, CompassCurve, curve_of_errors, sector_of
 from groundproc.estimation.odometry.grid import STEPS

@@ -20,8 +20,9 @@ from groundproc.estimation.dynamic import course as courses
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
 from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
-from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.method import Given, Progress
 from groundproc.sensors.hdl32e import Gate
+from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

@@ -97,7 +97,12 @@ def applied(trajectory: Trajectory, values: Array) -> Trajectory:
         trajectory.sigma_position_m,
         trajectory.sigma_attitude_rad,
     )
-    return replace(made, covered=made.covered & trajectory.covered, interpolation=trajectory.interpolation)
+    return replace(
+        made,
+        covered=made.covered & trajectory.covered,
+        interpolation=trajectory.interpolation,
+        correlation=trajectory.correlation,
+    )
 
 
 def read_yaw(path: Path) -> tuple[Times, Array, Array]:

@@ -28,13 +28,13 @@ from groundproc.estimation.calibration.compass import (
 from groundproc.estimation.dynamic import ground_model, plan
 from groundproc.estimation.dynamic.course import Course, compare
 from groundproc.estimation.dynamic.ground_model import Raster
-from groundproc.estimation.dynamic.options import DynamicOptions, StepOptions
 from groundproc.estimation.dynamic.plan import DistanceMap
 from groundproc.estimation.dynamic.revolutions import Revolution
 from groundproc.estimation.dynamic.search import VARIABLES, Found, Search
 from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
 from groundproc.geodesy import LocalFrame
 from groundproc.products.trim_table import write_trims
+from groundproc.survey.dynamic import DynamicOptions, StepOptions
 from groundproc.trajectory.table import from_poses
 
 Array = npt.NDArray[np.float64]

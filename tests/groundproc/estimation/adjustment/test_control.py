@@ -10,10 +10,11 @@ import pytest
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.estimation.adjustment.batch import Posterior, turned, whole_covariance
+from groundproc.estimation.adjustment.batch import turned
 from groundproc.estimation.adjustment.control import GATE_M, Held, control_report, control_warnings, held_to, spots_of
 from groundproc.estimation.adjustment.datum import Datum, Placing, find_datum
 from groundproc.estimation.adjustment.factors import Unknowns
+from groundproc.estimation.adjustment.posterior import Posterior, whole_covariance
 from groundproc.estimation.adjustment.solve import Wide
 from groundproc.estimation.adjustment.surfaces import Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters

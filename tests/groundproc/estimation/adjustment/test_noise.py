@@ -5,10 +5,10 @@ import numpy.typing as npt
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from groundproc.estimation.adjustment.batch import Posterior
 from groundproc.estimation.adjustment.factors import Factor, Unknowns
 from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Carrying, Noise, followed, lasting, noise_of
 from groundproc.estimation.adjustment.planes import rows_of
+from groundproc.estimation.adjustment.posterior import Posterior
 from groundproc.estimation.adjustment.solve import Problem, problem
 from groundproc.estimation.odometry.grid import STEPS
 from tests.helpers.circling import INTERVALS, circle, factors_of, room, unknowns_of_whole
