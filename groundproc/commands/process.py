@@ -142,9 +142,18 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         + (f"; {sync['note']}" if sync["note"] else ""),
         *_control_lines(quality.get(track["method"], {}).get("control")),
         _mount_line(quality["mount"]),
-        f"look at {folder / 'cloud_height.png'} and {folder / 'cloud_intensity.png'}; all figures are in {folder / 'quality.json'}",
+        *_where(folder),
     ]
     return "\n".join(lines)
+
+
+def _where(folder: Path) -> list[str]:
+    """What to look at first, of what was chosen."""
+    shown = [folder / name for name in ("cloud_height.png", "cloud_intensity.png") if (folder / name).exists()]
+    parts = [f"look at {' and '.join(map(str, shown))}"] if shown else []
+    if (figures := folder / "quality.json").exists():
+        parts.append(f"all figures are in {figures}")
+    return ["; ".join(parts)] if parts else []
 
 
 def _mount_line(mount: dict[str, Any]) -> str:

@@ -9,10 +9,12 @@ from typing import Any, Final
 
 from flightlog.hdl32e import RANGE_LSB_M
 from groundproc import geodesy
-from groundproc.cloud.placing import write_cloud
+from groundproc.cloud import placing
 from groundproc.flight.timeline import tied
 from groundproc.geodesy import LocalFrame
-from groundproc.products.pictures import draw_cloud
+from groundproc.products import chosen, plain
+from groundproc.products.product import Context, streamed
+from groundproc.sensors.hdl32e import Gate
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.run import Run
 from groundproc.steps.step import Request, Step
@@ -23,13 +25,15 @@ FOUND: Final = f"{INSIDE}/place.json"
 
 
 def settings(request: Request) -> Mapping[str, Any]:
-    """The window of shots, the CRS, and what heights refer to."""
+    """The window of shots, the CRS, what heights refer to, and the products that take points."""
     survey = request.survey
-    return section(survey, PlacingSettings) | {"crs": survey.crs, "height": survey.height}
+    products = plain(each for each in chosen(survey.products) if each.takes_points)
+    return section(survey, PlacingSettings) | {"crs": survey.crs, "height": survey.height, "products": products}
 
 
 def check(request: Request) -> None:
-    """Refuse a wrong code before the work, not after."""
+    """Refuse a wrong code and a product that there is not before the work, not after."""
+    chosen(request.survey.products)
     if request.survey.crs is not None:
         geodesy.projected_crs(request.survey.crs)
 
@@ -45,10 +49,12 @@ def work(run: Run, folder: Path) -> None:
     made = run.estimate
     timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
     projection = projection_of(made.trajectory.frame, run.survey)
-    tally, sample = write_cloud(
-        run.readers, timeline, made, run.survey, projection, folder, functools.partial(run.progress, "place")
-    )
-    draw_cloud(folder, sample, projection.crs.name)
+    survey, tally = run.survey, placing.Tally()
+    context = Context(folder, run.folder, survey, made, projection, inputs=run.names)
+    packets = placing.chunks(run.readers, timeline, tally, functools.partial(run.progress, "place"))
+    gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
+    with streamed(chosen(survey.products), context) as sinks:
+        placed = placing.place(packets, made.trajectory, made.mount, projection, sinks, gate=gate, lasers=made.lasers)
     found = {
         "crs": {"epsg": projection.crs.to_epsg(), "name": projection.crs.name},
         "lidar": {
@@ -62,7 +68,7 @@ def work(run: Run, folder: Path) -> None:
                 "rejected": tally.rejected,
             },
         },
-        "points": {"written": tally.written, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(tally.dropped)},
+        "points": {"written": placed.points, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(placed.dropped)},
     }
     path = folder / FOUND
     path.parent.mkdir(exist_ok=True)

@@ -30,7 +30,7 @@ from groundproc.steps.ledger import (
 )
 from groundproc.steps.run import Run
 from groundproc.steps.software import version
-from groundproc.steps.step import Key, Request, Step, steps
+from groundproc.steps.step import Key, Request, Step, absolute, steps
 from groundproc.survey import FILES, Survey
 
 
@@ -141,11 +141,14 @@ def _refuse_foreign(ledger: Ledger, outputs: dict[str, Any]) -> None:
 
 def key_of(step: Step, request: Request, ledger: Ledger) -> Key:
     """What decides about the outcome of a step whose forerunners are done."""
+    files = step.files(request)
+    # of a file the content counts, and not where it lies
+    settings = {name: "a file" if name in files else value for name, value in step.settings(request).items()}
     return {
         "software": version(),
         "logs": sorted(ledger.fingerprint(log).digest for log in request.logs) if step.reads_logs else [],
-        "settings": dict(step.settings(request)),
-        "files": {name: ledger.fingerprint(path).digest for name, path in step.files(request).items()},
+        "settings": settings,
+        "files": {name: ledger.fingerprint(path).digest for name, path in files.items()},
         "after": {name: ledger.entries[name].digest() for name in step.after},
     }
 
@@ -282,19 +285,6 @@ def remembered(folder: Path) -> Request | None:
         return None
     survey = config.from_mapping(ledger.survey, Survey, str(ledger.path))
     return Request([Path(log) for log in ledger.logs], survey, Path(ledger.poses) if ledger.poses else None)
-
-
-def absolute(survey: Survey) -> Survey:
-    """A survey whose names of files hold from everywhere."""
-    from groundproc.sensors.lasers import ESTIMATE
-
-    tree = config.to_mapping(survey)
-    for name in FILES:
-        if isinstance(tree[name], str) and tree[name] != ESTIMATE:
-            tree[name] = str(Path(tree[name]).resolve())
-    if isinstance(tree["geoid"], str) and Path(tree["geoid"]).is_file():
-        tree["geoid"] = str(Path(tree["geoid"]).resolve())
-    return config.from_mapping(tree, Survey, "survey")
 
 
 @contextlib.contextmanager

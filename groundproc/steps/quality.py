@@ -12,14 +12,14 @@ from flightlog.clock import utc_text
 from groundproc.estimation import ins
 from groundproc.steps import clocks, place
 from groundproc.steps.run import Run
-from groundproc.steps.step import Request, Step
+from groundproc.steps.step import Request, Step, absolute
 from groundproc.survey import SECTIONS, Survey, section
 from groundproc.trajectory.estimate import Estimate
 
 
 def settings(request: Request) -> Mapping[str, Any]:
     """All of them: they stand in it."""
-    return section(request.survey, *SECTIONS)
+    return section(absolute(request.survey), *SECTIONS)
 
 
 def work(run: Run, folder: Path) -> None:

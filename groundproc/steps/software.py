@@ -4,6 +4,7 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+import firmware_config
 import flightlog
 import groundproc
 
@@ -12,9 +13,9 @@ import groundproc
 def version() -> str:
     """Such as 0.1.0+3f9a0c12."""
     digest = hashlib.sha256()
-    for package in (flightlog, groundproc):
+    for package, kind in ((flightlog, "*.py"), (groundproc, "*.py"), (firmware_config, "*.yaml")):
         root = Path(package.__path__[0])
-        for path in sorted(root.rglob("*.py")):
+        for path in sorted(root.rglob(kind)):
             digest.update(f"{path.relative_to(root)} {path.stat().st_size}\n".encode())
             digest.update(path.read_bytes())
     return f"{flightlog.__version__}+{digest.hexdigest()[:8]}"

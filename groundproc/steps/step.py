@@ -6,8 +6,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flightlog import config
+from groundproc.sensors.lasers import ESTIMATE
 from groundproc.steps import ORDER
-from groundproc.survey import Survey
+from groundproc.survey import FILES, Survey
 
 if TYPE_CHECKING:
     from groundproc.steps.run import Run
@@ -72,3 +74,14 @@ class Step:
 def steps() -> list[Step]:
     """All steps, in the order of the flight."""
     return [import_module(f"groundproc.steps.{name}").STEP for name in ORDER]
+
+
+def absolute(survey: Survey) -> Survey:
+    """A survey whose names of files hold from everywhere."""
+    tree = config.to_mapping(survey)
+    for name in FILES:
+        if isinstance(tree[name], str) and tree[name] != ESTIMATE:
+            tree[name] = str(Path(tree[name]).resolve())
+    if isinstance(tree["geoid"], str) and Path(tree["geoid"]).is_file():
+        tree["geoid"] = str(Path(tree["geoid"]).resolve())
+    return config.from_mapping(tree, Survey, "survey")

@@ -62,10 +62,7 @@ def check(request: Request) -> None:
 
 def work(run: Run, folder: Path) -> None:
     """Estimate, and write the estimate's folder."""
-    made = estimate(run)
-    write_estimate(folder, made)
-    for write in made.products:
-        write(folder)
+    write_estimate(folder, estimate(run))
 
 
 def estimate(run: Run) -> Estimate:

@@ -115,11 +115,10 @@ class PlacingSettings:
 
     fov_deg: tuple[float, float] = setting(
         (255.0, 105.0),
-        "azimuths kept, clockwise from first to second, in degrees",
+        "azimuths kept, clockwise from first to second, in degrees; 0 and 360 keep all",
         words=("--fov",),
         metavar="A-B",
         reads="azimuths",
-        in_file="[0, 360] keeps all",
         minimum=-360,
         maximum=360,
     )
@@ -137,7 +136,7 @@ class PlacingSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """Output: coordinates and heights of the products."""
+    """Output: which products, and their coordinates and heights."""
 
     crs: int | str | None = setting(
         None,
@@ -154,6 +153,15 @@ class OutputSettings:
         words=("--geoid",),
         metavar="N",
         absent="none",
+    )
+    products: tuple[Any, ...] | None = setting(
+        None,
+        "what is made beside trajectory.csv and quality.json, by name: cloud.laz,pictures",
+        words=("--products",),
+        metavar="NAMES",
+        reads="names",
+        absent="all of docs/products.md that are made by default",
+        in_file="a list; a name with options of its own is a mapping: [cloud.laz, {NAME: {OPTION: VALUE}}]",
     )
 
 

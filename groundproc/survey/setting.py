@@ -1,6 +1,7 @@
 """How an option is declared once: from the declaration come the YAML sample, the command line with its help, and the docs."""
 
 import dataclasses
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -13,6 +14,10 @@ from flightlog.config import option
 
 COMMAND: Final = "command"
 """Key of a `Command` in the metadata of a dataclass field."""
+
+
+WIDTH: Final = 116
+"""Of the comments in a sample file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +96,9 @@ def value_text(value: Any) -> str:
 def sample_lines(values: Any, field: "dataclasses.Field[Any]", notes: Sequence[str] = ()) -> Iterator[str]:
     """One option of a commented YAML file: its meaning, notes about this flight, its value."""
     choices = field.metadata.get("choices")
-    yield f"# {field.metadata['about']}" + (f" ({' | '.join(map(str, choices))})" if choices else "")
-    yield from (f"# {note}" for note in notes)
+    about = field.metadata["about"] + (f" ({' | '.join(map(str, choices))})" if choices else "")
+    for text in (about, *notes):
+        yield from (f"# {line}" for line in textwrap.wrap(text, WIDTH))
     value = getattr(values, field.name)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield f"{field.name}:"
