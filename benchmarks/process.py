@@ -100,7 +100,7 @@ def measure(folder: Path) -> dict[str, Any]:
     runs: list[Run] = []
     limits: list[Run] = []
     for number in range(1, ROUNDS + 1):
-        runs.append(timed(lambda: swath("process", long_log, "--method", "ins", "-o", products)))
+        runs.append(timed(lambda: swath("process", long_log, "--method", "ins", "--force", "-o", products)))
         limits.append(timed(lambda: compress(points, folder / "limit.laz")))
         for name, run in (("swath process", runs[-1]), ("compression", limits[-1])):
             print(

@@ -17,6 +17,7 @@ from numba import njit
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.geodesy import LocalFrame
+from groundproc.trajectory.covariance import Correlation, chained, scaled, uncorrelated
 
 Array = npt.NDArray[np.float64]
 
@@ -62,6 +63,8 @@ class Trajectory:
         Whether the interval from each knot to the next is covered; False for the last.
     interpolation : str
         "cubic", or "hold": the nearest knot's pose, as the source does on its 10 ms grid.
+    correlation : Correlation, optional
+        Of the six errors of a pose, at knots of its own; None: they are taken to be independent.
     """
 
     frame: LocalFrame
@@ -74,6 +77,7 @@ class Trajectory:
     sigma_attitude_rad: Array
     covered: npt.NDArray[np.bool_]
     interpolation: str = SMOOTH
+    correlation: Correlation | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -83,7 +87,10 @@ class Trajectory:
         arrays = {name: getattr(self, name)[chosen] for name in _ARRAYS}
         covered = arrays["covered"].copy()
         covered[-1:] = False
-        return replace(self, **arrays | {"covered": covered})
+        correlation, time_ns = self.correlation, arrays["time_ns"]
+        if correlation is not None and len(time_ns):
+            correlation = correlation.between(int(time_ns[0]), int(time_ns[-1]))
+        return replace(self, **arrays | {"covered": covered}, correlation=correlation)
 
     def before(self, time_ns: int) -> "Trajectory":
         """The knots up to a time [ns]."""
@@ -133,6 +140,32 @@ class Trajectory:
             )
         return poses
 
+    def covariance_at(self, time_ns: npt.NDArray[np.int64]) -> Array:
+        """Covariance of poses at times, shape (n, 6, 6): east, north, up [m], roll, pitch, heading [rad].
+
+        Sigmas and correlations are interpolated linearly (see `covariance`); a sigma that nobody stated makes its row and column
+        not-a-number.
+
+        Raises
+        ------
+        CoverageError
+            A time before the first knot or after the last.
+        """
+        times = np.asarray(time_ns, np.int64)
+        outside = (times < self.time_ns[0]) | (times > self.time_ns[-1])
+        if outside.any():
+            raise CoverageError(
+                f"trajectory: no covariance at {utc_text(int(times[outside][0]))}; it covers {utc_text(int(self.time_ns[0]))} to "
+                f"{utc_text(int(self.time_ns[-1]))}"
+            )
+        seconds, knots_s = (times - self.time_ns[0]) * 1e-9, (self.time_ns - self.time_ns[0]) * 1e-9
+        position, attitude = (
+            np.stack([np.interp(seconds, knots_s, column) for column in sigma.T], axis=1)
+            for sigma in (self.sigma_position_m, self.sigma_attitude_rad)
+        )
+        matrix = uncorrelated(times).matrix if self.correlation is None else self.correlation.at(times)
+        return scaled(matrix, position, attitude)
+
 
 _ARRAYS: Final = (
     "time_ns", "position_m", "velocity_m_s", "quat_local_ins_wxyz", "rate_rad_s", "sigma_position_m", "sigma_attitude_rad", "covered",
@@ -157,7 +190,21 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
                 f"{utc_text(int(second.time_ns[0]))}, expected later"
             )
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
-    return replace(parts[0], **arrays)
+    return replace(parts[0], **arrays, correlation=_correlation_of(parts))
+
+
+def _correlation_of(parts: Sequence[Trajectory]) -> Correlation | None:
+    """The correlations of parts that follow each other; None where no part has any."""
+    if all(part.correlation is None for part in parts):
+        return None
+    return chained(
+        [
+            uncorrelated(part.time_ns[[0, -1]])
+            if part.correlation is None
+            else part.correlation.between(int(part.time_ns[0]), int(part.time_ns[-1]))
+            for part in parts
+        ]
+    )
 
 
 @njit(cache=True, nogil=True)

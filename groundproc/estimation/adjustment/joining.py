@@ -22,6 +22,7 @@ from flightlog import frames
 from groundproc.estimation.adjustment.batch import DRAWS, add_world, corrected, held, linearised, told_by
 from groundproc.estimation.adjustment.noise import noise_of
 from groundproc.estimation.adjustment.patches import Patches, coarse
+from groundproc.estimation.adjustment.poses import pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.observations.lidar import DEFLATION
@@ -30,6 +31,7 @@ from groundproc.estimation.observations.planes import Rows, placed, rows_of
 from groundproc.estimation.observations.rows import Factor, H, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.trajectory.covariance import SIZE, Correlation
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -50,6 +52,8 @@ LEAST_TURN: Final = np.deg2rad(0.0005)
 LEAST_SHIFT_M: Final = 0.0003
 """Of a window's shape no more is claimed, per root second."""
 LEAST_TILT: Final = np.deg2rad(0.003)
+SMOOTH_DRAWS: Final = 5
+"""Knots over which correlations of what is drawn are averaged: ten seconds."""
 TILT_TAU_S: Final = 240.0
 """The tilt of a path against gravity is that of the accelerometers' biases as a window knows them."""
 
@@ -191,23 +195,25 @@ class Joining:
         knots = slice(None, None, STEPS)
         mats, place = frames.mat_from_quat(self.path.quat[knots]), self.path.position_m[knots]
         names = unknowns.names
-        heading = frames.attitude_of(mats @ self.mat_sensor_ins)[0]
+        heading, pitch, _ = frames.attitude_of(mats @ self.mat_sensor_ins)
 
         def poses(x: Array) -> Array:
-            """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+            """Errors of position, and turns about the levelled axes forward, right, up, shape (n, 6)."""
             rotation, moved = _at_knots(x[: unknowns.path_size], mats)
             whole = x[names["world.turn"]]
             turn = rotation + whole
             forward = turn[:, 0] * np.sin(heading) + turn[:, 1] * np.cos(heading)
             right = turn[:, 0] * np.cos(heading) - turn[:, 1] * np.sin(heading)
             position = moved + np.cross(whole, place) + x[names["world.shift"]]
-            return np.stack([position, np.stack([forward, right, turn[:, 2]], axis=1)])
+            return np.column_stack([position, forward, right, turn[:, 2]])
 
+        errors = pose_errors(spread, poses, pitch, smooth=1, smooth_draws=SMOOTH_DRAWS)
         at = np.arange(len(self.begin.quat)) / STEPS
         sigmas = [
             np.stack([np.interp(at, np.arange(len(mats)), axis) for axis in part.T], axis=1)
-            for part in np.sqrt(spread.variance(poses))
+            for part in (errors.sigma_position_m, errors.sigma_attitude_rad)
         ]
+        correlation = Correlation(np.arange(len(mats)) * STEPS, errors.correlation).at(np.arange(len(self.begin.quat)))
         values = self.unknowns().value
         found = {
             name: (values[name], np.sqrt(spread.variance(operator.itemgetter(where))))
@@ -215,7 +221,7 @@ class Joining:
             if not name.startswith("world.")
         }
         told = told_by(self.observations, self.state())
-        return Joined(self.begin, self.path, sigmas[0], sigmas[1], found, self.log, told)
+        return Joined(self.begin, self.path, sigmas[0], sigmas[1], found, self.log, told, correlation)
 
 
 @dataclass(slots=True)
@@ -233,6 +239,8 @@ class Joined:
     log : list of dict
     told : dict of str to Any
         What the observations say, by their names.
+    correlation : ndarray, shape (slices + 1 or more, 6, 6)
+        Of the errors of position and attitude at slice boundaries.
     """
 
     begin: Path
@@ -242,6 +250,7 @@ class Joined:
     values: dict[str, tuple[Array, Array]]
     log: list[dict[str, float]]
     told: dict[str, Any] = field(default_factory=dict)
+    correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
 
     def applied(self, path: Path) -> Path:
         """The path that was begun with, on its fine grid, as corrected."""

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
 from groundproc.estimation.adjustment.batch import DRAWS, Batch
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
+from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
 from groundproc.estimation.observations import lasers
 from groundproc.estimation.observations.lidar import Lidar
@@ -26,6 +26,7 @@ from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.motion import Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
+from groundproc.trajectory.covariance import SIZE
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +40,10 @@ LEVER_FLOOR_M: Final = 0.003
 """The same for the lever arm, which is found through accelerometers whose axes are no better."""
 UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
 """What the residuals do not show, by the global that it is in."""
+SMOOTH: Final = 11
+SMOOTH_DRAWS: Final = 101
+"""Slices over which variances of poses are averaged, and correlations of what is drawn: ten seconds hold several times the errors that
+one knot has, and a leg of the flight is longer."""
 CALIBRATION: Final = ("ins.turn", "ins.lever", "ins.scale", "ins.delay", "ins.drift")
 """What other flights go by: their covariance is not drawn, but solved for column by column."""
 
@@ -102,6 +107,8 @@ class Window:
     seen : Seen or None
         What the joining needs of it; a window that is the whole flight is not joined, and its sigmas are those of the whole. Those of
         the others are what they do not know of themselves.
+    correlation : ndarray, shape (slices + 1, 6, 6)
+        Of the errors of position and attitude.
     """
 
     first: int
@@ -117,6 +124,7 @@ class Window:
     corrections: tuple[Array, Array] | None = None
     told: dict[str, Any] = field(default_factory=dict)
     seen: "Seen | None" = None
+    correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
 
 
 @dataclass(slots=True)
@@ -169,13 +177,13 @@ def adjust_window(
         seen = Seen(patches_of(lidar.clusters, batch.path, len(before)), stiffness, kept)
         # how the whole lies is asked for when all windows are joined
         spread = spread.without([posterior.unknowns.names[name] for name in ("world.turn", "world.shift")])
-    position, attitude = _sigmas(batch.path, posterior.unknowns, spread, mat, lever, motion.rate_density)
+    errors = _errors(batch.path, posterior.unknowns, spread, mat, lever, motion.rate_density)
     corrections = None
     if sources.lasers_apart:
         corrections = lidar.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
     return Window(
-        first, last, last - first, batch.path, values, unknowns, position, attitude, batch.log, exact, corrections,
-        batch.said(), seen,
+        first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
+        batch.log, exact, corrections, batch.said(), seen, errors.correlation,
     )  # fmt: skip
 
 
@@ -214,19 +222,19 @@ def _values(
     return found, covariance[:asked, :asked] if exact and set(exact) <= set(found) else None
 
 
-def _sigmas(
+def _errors(
     path: Path, unknowns: Unknowns, spread: Spread, mat_ins_lidar: Array, lever: Array, rate_density: float
-) -> tuple[Array, Array]:
-    """Sigmas of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
+) -> PoseErrors:
+    """Errors of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
     quat, place = path.quat[::STEPS], path.position_m[::STEPS]
     mats = frames.mat_from_quat(quat)
     to_ins = -mat_ins_lidar.T @ lever
-    heading = frames.attitude_of(mats @ mat_ins_lidar.T)[0]
+    heading, pitch, _ = frames.attitude_of(mats @ mat_ins_lidar.T)
     right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
     ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
 
     def poses(x: Array) -> Array:
-        """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+        """Errors of position, and turns about the levelled axes forward, right, up, shape (n, 6)."""
         part = {name: x[where] for name, where in unknowns.names.items()}
         spline = x[: unknowns.path_size].reshape(-1, 6)
         at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
@@ -235,19 +243,13 @@ def _sigmas(
         arm = np.cross(at[:, :3], to_ins) + part.get("ins.lever", np.zeros(3))
         moved = at[:, 3:] + np.cross(part["world.turn"], place) + part["world.shift"]
         position = moved + np.einsum("nij,nj->ni", mats, arm)
-        return np.stack(
-            [
-                position,
-                np.stack([(turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1), turn[:, 2]], axis=1),
-            ]
-        )
+        forward, sideways = (turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1)
+        return np.column_stack([position, forward, sideways, turn[:, 2]])
 
-    position, attitude = uniform_filter1d(spread.variance(poses), 11, axis=1, mode="nearest")
-    if "ins.turn" in unknowns.names:
-        attitude = attitude + MISALIGNMENT_RAD**2
     # what the gyro adds between two knots, the mean of a Brownian bridge
     bridge = rate_density**2 * H / 6.0
-    return np.sqrt(position), np.sqrt(attitude + bridge)
+    extra = bridge + (MISALIGNMENT_RAD**2 if "ins.turn" in unknowns.names else 0.0)
+    return pose_errors(spread, poses, pitch, smooth=SMOOTH, smooth_draws=SMOOTH_DRAWS, extra=extra)
 
 
 def joined_path(windows: Sequence[Window]) -> Path:

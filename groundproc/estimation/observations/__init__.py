@@ -5,7 +5,7 @@ A kind is a module with one or both of
     of_run(flown: Flown) -> list[Observation]    for the adjustment: what of this kind a run of the lidar's clock has
     of_leg(heard: Heard) -> list[Measured]       for the smoother: what of this kind a leg has
 
-and one name in `KINDS`; observations of no file of the survey are handed to `adjusted.estimate`. The engines (adjustment.batch,
+and one name in `KINDS`; observations of no file of the survey are handed to `adjusted_estimate`. The engines (adjustment.batch,
 adjustment.joining, inertial.solution) know lists of observations and nothing of their kinds. docs/methods/observations.md has an
 example.
 

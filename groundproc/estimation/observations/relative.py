@@ -1,7 +1,7 @@
 """Poses that follow each other: odometry of another program, by lidar or by images, whose steps are good and whose course drifts.
 
 Between two stamps the pose of the airframe against the one before is stated, with a covariance of six. Where the whole lies is not used.
-No file that the survey names states steps: they are handed to `adjusted.estimate` by who made them.
+No file that the survey names states steps: they are handed to `adjusted_estimate` by who made them.
 A source has a clock and a lever arm of its own; the lever arm is that of the point whose poses they are.
 """
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from groundproc.estimation.adjustment.adjusted import Run
+from groundproc.estimation.adjustment.run import Run
 from groundproc.estimation.observations.fixes import SLID_SIGMAS, Fixes
 
 
