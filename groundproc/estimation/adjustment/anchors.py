@@ -10,8 +10,9 @@ from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.adjustment.factors import Factor, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Attitudes, Positions
+from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

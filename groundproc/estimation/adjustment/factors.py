@@ -16,6 +16,7 @@ from flightlog import frames
 from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path, integrated
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -137,11 +138,7 @@ def eye(count: int) -> Array:
 
 def robust_sigma(residual: Array, least: float) -> float:
     """Standard deviation from the median absolute deviation."""
-    return (
-        max(float(1.4826 * np.median(np.abs(residual - np.median(residual, axis=0)))), least)
-        if len(residual)
-        else least
-    )
+    return max(robust.sigma(residual, np.median(residual, axis=0)), least) if len(residual) else least
 
 
 @dataclass(slots=True)

@@ -38,9 +38,10 @@ from groundproc.estimation.adjustment.planes import Rows, placed, rows_of
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Attitudes, Positions
 from groundproc.flight.control import ControlPoint
+from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

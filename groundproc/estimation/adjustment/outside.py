@@ -21,6 +21,7 @@ from groundproc.estimation.odometry.spline import Path
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.positions.solution import Quality
 from groundproc.flight.timebase import UtcTie
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -305,7 +306,7 @@ def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: 
     distance = np.linalg.norm(np.linalg.solve(spread, centred[:, :, None])[:, :, 0], axis=1)
     # 1.54: the median of the distance of three unit normals
     usual = OUTLIER * max(1.0, float(np.median(distance)) / 1.54)
-    share = np.minimum(1.0, usual / np.maximum(distance, 1e-12))
+    share = robust.huber(distance, usual)
     white = np.linalg.inv(spread) * np.sqrt(share / inflation)[:, None, None]
     blocks = sparse.block_diag(white, format="csr")
     return Factor(name, blocks @ residual.ravel(), (blocks @ matrix).tocsr(), np.ones(residual.size))

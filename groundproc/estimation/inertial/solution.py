@@ -34,6 +34,7 @@ from groundproc.estimation.inertial.readings import (
     drives,
     standing,
 )
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -364,7 +365,7 @@ def _learnt(model: Model, system: System, residual: Array, states: Array, varian
     for kind, (name, least, most) in _LEARNT.items():
         chosen = residual[system.kind == KINDS.index(kind)]
         if len(chosen) >= 50:
-            changed[name] = float(np.clip(1.4826 * np.median(np.abs(chosen)), least, most))
+            changed[name] = float(np.clip(robust.sigma(chosen, 0.0), least, most))
     for name, part, least, most in (
         ("tilt_rad", slice(TILT, TILT + 2), np.deg2rad(0.2), np.deg2rad(10.0)),
         ("heading_rad", slice(HEADING, HEADING + 1), np.deg2rad(0.3), np.deg2rad(20.0)),

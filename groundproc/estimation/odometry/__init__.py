@@ -5,7 +5,7 @@ motion      rates and specific force of all inertial sensors on that grid
 slices      shots to slices of 0.1 s, and each slice to clusters: the returns of one voxel at one instant
 clusters    clusters of many slices, as columns
 voxels      a map of planes in a hash of voxels
-spline      uniform cubic B-splines, and the path that they correct
+spline      the path of the sensor, and the spline that corrects it
 stated      positions and attitudes of the autopilot
 odometry    an iterated error-state filter; the causal mode
 track       the forward pass: start, silent slices, fixes, loss of way

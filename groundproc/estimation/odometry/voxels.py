@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.numerics.rotations import flattest
+from groundproc.numerics.planes import add_scatter, flattest_of
 from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
@@ -124,19 +124,11 @@ def _insert(
         v[MEAN] += share * dx
         v[MEAN + 1] += share * dy
         v[MEAN + 2] += share * dz
-        v[SCATTER] += scatter[n, 0] + weight * dx * dx
-        v[SCATTER + 1] += scatter[n, 1] + weight * dx * dy
-        v[SCATTER + 2] += scatter[n, 2] + weight * dx * dz
-        v[SCATTER + 3] += scatter[n, 3] + weight * dy * dy
-        v[SCATTER + 4] += scatter[n, 4] + weight * dy * dz
-        v[SCATTER + 5] += scatter[n, 5] + weight * dz * dz
+        add_scatter(v[SCATTER : SCATTER + 6], 1.0, scatter[n], weight, (dx, dy, dz))
         v[FLATNESS] = -1.0
         if total >= FEWEST:
             s = 1.0 / total
-            low, middle = flattest(
-                s * v[SCATTER], s * v[SCATTER + 1], s * v[SCATTER + 2], s * v[SCATTER + 3], s * v[SCATTER + 4],
-                s * v[SCATTER + 5], normal,
-            )  # fmt: skip
+            low, middle = flattest_of(v[SCATTER : SCATTER + 6], s, normal)
             if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
                 v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
                 v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]

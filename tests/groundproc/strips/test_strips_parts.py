@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from flightlog.errors import SwathError
 from groundproc.estimation.adjustment.factors import Unknowns
-from groundproc.estimation.adjustment.planes import TILT_PRIOR
 from groundproc.geodesy import projected_crs
+from groundproc.numerics.planerows import TILT_PRIOR
 from groundproc.strips.adjust import Linear, Sigmas, constant_prior, wandering
 from groundproc.strips.clouds import Clock, chunks, look
 from groundproc.strips.clusters import CLUSTER, Gatherer
