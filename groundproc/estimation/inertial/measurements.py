@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
+from groundproc.estimation.inertial.kalman import Rows
 from groundproc.estimation.inertial.model import (
     ATTITUDE,
     BARO,
@@ -81,9 +82,9 @@ class System:
     variance: Array
     kind: npt.NDArray[np.int8]
 
-    def rows(self) -> tuple[Any, ...]:
+    def rows(self) -> Rows:
         """As the filter takes them."""
-        return self.count, self.index, self.value, self.measured, self.variance
+        return Rows(self.first, self.count, self.index, self.value, self.measured, self.variance)
 
 
 @dataclass(slots=True)

@@ -7,7 +7,7 @@ State, and error state of 18: attitude (in the body), position, velocity, bias o
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,23 @@ from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import Motion
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
-from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, TILT, PlaneMap, find
+from groundproc.estimation.odometry.voxels import (
+    COUNT,
+    FLATNESS,
+    LEVEL,
+    MEAN,
+    NORMAL,
+    SCATTER,
+    TILT,
+    MapArrays,
+    PlaneMap,
+    find,
+)
 from groundproc.numerics.rotations import mat_of_quat, quat_difference, quat_turned, unit_vector
 from groundproc.numerics.voxelhash import voxel_key
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 STATES: Final = 18
 STEP_S: Final = STEP_NS * 1e-9
@@ -61,6 +73,56 @@ class State:
     accel_bias_m_s2: Array
     gravity_m_s2: Array
     covariance: Array
+
+    @property
+    def arrays(self) -> "StateArrays":
+        """What the kernels take, and change in place; all but the covariance."""
+        return StateArrays(
+            self.quat, self.position_m, self.velocity_m_s, self.gyro_bias_rad_s, self.accel_bias_m_s2, self.gravity_m_s2
+        )
+
+
+class StateArrays(NamedTuple):
+    """A `State` as kernels take it, without its covariance; the fields stand there."""
+
+    quat: Array
+    position_m: Array
+    velocity_m_s: Array
+    gyro_bias_rad_s: Array
+    accel_bias_m_s2: Array
+    gravity_m_s2: Array
+
+
+class _Matches(NamedTuple):
+    """What clusters have found in the map.
+
+    Attributes
+    ----------
+    row : ndarray of int64, shape (n,)
+        Of the voxel, -1 where there is no plane.
+    residual_m : ndarray, shape (n,)
+        Distance from its plane.
+    weight : ndarray, shape (n,)
+        [1/m^2]
+    """
+
+    row: Ints
+    residual_m: Array
+    weight: Array
+
+
+class _Normal(NamedTuple):
+    """Normal equations of a pose's correction, by rotation in the body and by position.
+
+    Attributes
+    ----------
+    information : ndarray, shape (6, 6)
+    pull : ndarray, shape (6,)
+        Weighted sum of the rows times their distances.
+    """
+
+    information: Array
+    pull: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,10 +215,7 @@ class Odometry:
             rate, force = self._motion.rate_rad_s[part], self._motion.force_m_s2[part]
             if len(rate) < STEPS:
                 raise IndexError(f"slice {self.number} lies beyond the inertial data")
-            s.covariance = _propagate(
-                rate, force, s.quat, s.position_m, s.velocity_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, s.gravity_m_s2,
-                s.covariance, self._noise, quats, positions,
-            )  # fmt: skip
+            s.covariance = _propagate(rate, force, s.arrays, s.covariance, self._noise, (quats, positions))
             self.number += 1
         return quats, positions
 
@@ -174,10 +233,8 @@ class Odometry:
         body = (world - s.position_m) @ mat
         if self.map.count:
             matched, residual, s.covariance = _update(
-                self.map.table, self.map.keys, self.map.voxels, self.voxel_m, body, clusters["count"], s.quat,
-                s.position_m, s.velocity_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, s.gravity_m_s2, s.covariance,
-                self._ground,
-            )  # fmt: skip
+                self.map.arrays, body, clusters["count"], s.arrays, s.covariance, self._ground
+            )
             mat_of_quat(s.quat, mat)
             world = body @ mat.T + s.position_m
         self.map.insert(world, clusters, self.MOST)
@@ -220,12 +277,13 @@ class Odometry:
         s.covariance = keep @ s.covariance @ keep.T + gain @ np.diag(sigma_rad**2) @ gain.T
 
     def _correct(self, error: Array) -> None:
-        s = self.state
-        _apply(error, s.quat, s.position_m, s.velocity_m_s, s.gyro_bias_rad_s, s.accel_bias_m_s2, s.gravity_m_s2)
+        _apply(error, self.state.arrays)
 
 
 @njit(cache=True, nogil=True)
-def _apply(d: Any, quat: Any, position: Any, velocity: Any, gyro_bias: Any, accel_bias: Any, gravity: Any) -> None:
+def _apply(d: Array, state: StateArrays) -> None:
+    """Correct a state by an error state, shape (STATES,)."""
+    quat, position, velocity, gyro_bias, accel_bias, gravity = state
     quat_turned(quat, d[0], d[1], d[2], quat)
     for i in range(3):
         position[i] += d[3 + i]
@@ -241,9 +299,11 @@ def _apply(d: Any, quat: Any, position: Any, velocity: Any, gyro_bias: Any, acce
 
 @njit(cache=True, nogil=True)
 def _propagate(
-    rate: Any, force: Any, quat: Any, position: Any, velocity: Any, gyro_bias: Any, accel_bias: Any, gravity: Any,
-    covariance: Any, noise: Any, quats: Any, positions: Any,
-) -> Any:  # fmt: skip
+    rate: Array, force: Array, state: StateArrays, covariance: Array, noise: Array, poses: tuple[Array, Array]
+) -> Any:
+    """Carry a state on over some grid steps; gives its covariance, and fills in quaternions and positions of the grid."""
+    quat, position, velocity, gyro_bias, accel_bias, gravity = state
+    quats, positions = poses
     dt = STEP_S
     mat, change = np.empty((3, 3)), np.eye(STATES)
     quats[0], positions[0] = quat, position
@@ -283,7 +343,7 @@ def _propagate(
 
 
 @njit(cache=True, nogil=True)
-def observable(information: Any) -> Any:
+def observable(information: Array) -> Array:
     """Projection of a pose's correction, shape (6, 6), onto what planes really tell of it.
 
     Of directions that get less than `FLAT` of the information nothing is taken (after Zhang, Kaess, Singh 2016). Turns count by what
@@ -308,7 +368,7 @@ def observable(information: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _row(mat: Any, body: Any, nx: float, ny: float, nz: float, out: Any) -> None:
+def _row(mat: Array, body: Array, nx: float, ny: float, nz: float, out: Array) -> None:
     """How a distance along a normal changes with the pose of the slice's end: by rotation in the body, and by position."""
     p = nx * mat[0, 0] + ny * mat[1, 0] + nz * mat[2, 0]
     q = nx * mat[0, 1] + ny * mat[1, 1] + nz * mat[2, 1]
@@ -318,8 +378,9 @@ def _row(mat: Any, body: Any, nx: float, ny: float, nz: float, out: Any) -> None
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add(row: Any, weight: float, residual: float, information: Any, pull: Any) -> None:
+def _add(row: Array, weight: float, residual: float, normal: _Normal) -> None:
     """Add a row to the lower half of the information and to the pull."""
+    information, pull = normal.information, normal.pull
     for a in range(6):
         weighted = weight * row[a]
         pull[a] += weighted * residual
@@ -328,11 +389,14 @@ def _add(row: Any, weight: float, residual: float, information: Any, pull: Any) 
 
 
 @njit(cache=True, nogil=True)
-def _matches(
-    table: Any, keys: Any, voxels: Any, per_m: float, body: Any, counts: Any, mat: Any, position: Any, gate: float,
-    row: Any, residual: Any, weight: Any, ground: Any,
+def _match(
+    planes: MapArrays, body: Array, counts: npt.NDArray[np.int32], pose: tuple[Array, Array], gate_m: float, found: _Matches,
+    ground: Array,
 ) -> int:  # fmt: skip
     """Voxel of each cluster, -1 where it finds no plane, with distance and weight; the normals of ground, up, are added to `ground`."""
+    table, keys, voxels, voxel_m = planes
+    per_m, (mat, position) = 1.0 / voxel_m, pose
+    row, residual, weight = found
     matched = 0
     for n in range(len(body)):
         bx, by, bz = body[n, 0], body[n, 1], body[n, 2]
@@ -344,7 +408,7 @@ def _matches(
             continue
         v = voxels[row[n]]
         e = v[NORMAL] * x + v[NORMAL + 1] * y + v[NORMAL + 2] * z - v[LEVEL]
-        if v[FLATNESS] < 0.0 or abs(e) > gate:
+        if v[FLATNESS] < 0.0 or abs(e) > gate_m:
             row[n] = -1
             continue
         # a plane known from a few lines is uncertain away from them
@@ -362,25 +426,26 @@ def _matches(
 
 @njit(cache=True, nogil=True)
 def _accumulate(
-    voxels: Any, body: Any, mat: Any, row: Any, residual: Any, weight: Any, ground: Any, added: Any, pull: Any,
-    level_added: Any, level_pull: Any,
-) -> float:  # fmt: skip
-    """Information and pull of all matches, and the same with the mean normal for all ground; gives the sum of squares."""
+    voxels: Array, body: Array, mat: Array, found: _Matches, ground: Array, whole: _Normal, level: _Normal
+) -> float:
+    """Normal equations of all matches, and the same with the mean normal for all ground; gives the sum of squares."""
+    row, residual, weight = found
+    added, level_added = whole.information, level.information
     j = np.empty(6)
     squares = 0.0
     added[:, :], level_added[:, :] = 0.0, 0.0
-    pull[:], level_pull[:] = 0.0, 0.0
+    whole.pull[:], level.pull[:] = 0.0, 0.0
     for n in range(len(body)):
         if row[n] < 0:
             continue
         v, e = voxels[row[n]], residual[n]
         squares += e * e
         _row(mat, body[n], v[NORMAL], v[NORMAL + 1], v[NORMAL + 2], j)
-        _add(j, weight[n], e, added, pull)
+        _add(j, weight[n], e, whole)
         if abs(v[NORMAL + 2]) > GROUND:
             side = 1.0 if v[NORMAL + 2] > 0.0 else -1.0
             _row(mat, body[n], side * ground[0], side * ground[1], side * ground[2], j)
-        _add(j, weight[n], e, level_added, level_pull)
+        _add(j, weight[n], e, level)
     for a in range(6):
         for b in range(a):
             added[b, a], level_added[b, a] = added[a, b], level_added[a, b]
@@ -389,36 +454,36 @@ def _accumulate(
 
 @njit(cache=True, nogil=True)
 def _update(
-    table: Any, keys: Any, voxels: Any, voxel_m: float, body: Any, counts: Any, quat: Any, position: Any, velocity: Any,
-    gyro_bias: Any, accel_bias: Any, gravity: Any, covariance: Any, ground: Any,
-) -> Any:  # fmt: skip
+    planes: MapArrays, body: Array, counts: npt.NDArray[np.int32], state: StateArrays, covariance: Array, ground: Array
+) -> Any:
+    """Correct a state by the planes that clusters lie on; gives how many do, their RMS distance, and the covariance."""
+    quat, position = state.quat, state.position_m
     to_pose, mine = np.ascontiguousarray(covariance[:, :6]), np.ascontiguousarray(covariance[:6, :6])
     total = np.zeros(STATES)  # correction so far: the prior pulls back to where it began
     mat, turn = np.empty((3, 3)), np.empty(3)
     before = quat.copy()
-    added, pull, level_added, level_pull = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    whole, level = _Normal(np.zeros((6, 6)), np.zeros(6)), _Normal(np.zeros((6, 6)), np.zeros(6))
     factor, inner = np.zeros((6, 6)), np.eye(6)
-    row, residual, weight = np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body))
+    found = _Matches(np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body)))
     normals, up = ground.copy(), ground.copy()
     matched, squares = 0, 0.0
     for attempt in range(ROUNDS):
         mat_of_quat(quat, mat)
         gate = 0.5 if attempt == 0 else 0.25
         ground[:] = GROUND_MEMORY * normals
-        matched = _matches(
-            table, keys, voxels, 1.0 / voxel_m, body, counts, mat, position, gate, row, residual, weight, ground
-        )
+        matched = _match(planes, body, counts, (mat, position), gate, found, ground)
         up[:] = ground
         unit_vector(up)
-        squares = _accumulate(voxels, body, mat, row, residual, weight, up, added, pull, level_added, level_pull)
+        squares = _accumulate(planes.voxels, body, mat, found, up, whole, level)
+        added, pull = whole
         if matched:
             # normals of flat ground have errors, and thousands of them would seem to hold a place along it: whether anything does is
             # judged with their mean for all of them, and where nothing does, that is also what counts. Not the vertical: the map
             # leans by what the start's tilt was off, and a turn about any other axis than the ground's own normal tilts it
-            known = observable(level_added)
+            known = observable(level.information)
             if np.trace(known) < 5.5:
-                pull = np.ascontiguousarray(known.T) @ level_pull
-                added = np.ascontiguousarray(known.T) @ level_added @ np.ascontiguousarray(known)
+                pull = np.ascontiguousarray(known.T) @ level.pull
+                added = np.ascontiguousarray(known.T) @ level.information @ np.ascontiguousarray(known)
         # (P^-1 + A)^-1 by Woodbury's formula: P itself may be too nearly singular to invert. With A = L L^T it stays a covariance
         values, vectors = np.linalg.eigh(added)
         root = np.sqrt(np.maximum(values, 1e-13 * values[5] + 1e-12))
@@ -426,7 +491,7 @@ def _update(
         inner[:, :] = np.linalg.inv(np.eye(6) + factor.T @ mine @ factor)
         change = to_pose @ (factor @ (inner @ (factor.T @ total[:6] - (vectors.T @ pull) / root))) - total
         total += change
-        _apply(change, quat, position, velocity, gyro_bias, accel_bias, gravity)
+        _apply(change, state)
         # the attitude's correction as one rotation from the prediction
         quat_difference(before, quat, turn)
         total[:3] = turn

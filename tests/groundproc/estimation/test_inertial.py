@@ -108,10 +108,9 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
         for name in ("_forward", "_record", "_back"):
             monkeypatch.setattr(kalman, name, getattr(kalman, name).py_func)
     keep = np.tile(KEEP, (NODES - 1, 1))
-    smooth(
-        reference, (np.full(NODES - 1, STEP_S), angle, push, *densities), GRAVITY, keep, drive, first, rows, start, covariance, 1,
-        correction, residual, kept, kept_covariance, variance,
-    )  # fmt: skip
+    motion = kalman.Motion(*reference, np.full(NODES - 1, STEP_S), angle, push, *densities, GRAVITY, keep, drive)
+    out = kalman.Smoothed(1, correction, residual, kept, kept_covariance, variance)
+    smooth(motion, kalman.Rows(first, *rows), start, covariance, out)
     # all states of all nodes as one Gaussian vector, conditioned on all measurements at once
     noise = drive * STEP_S
     noise[3:6], noise[6:9] = densities[1][0] * STEP_S, densities[0][0] * STEP_S
