@@ -11,7 +11,6 @@ from numba import njit
 
 Array = npt.NDArray[np.float64]
 
-DEGREE: Final = 3
 AT_KNOT: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
 """Weights of the coefficients k to k + 2 at knot k; that of k + 3 is nothing."""
 

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.estimation.adjustment.anchors import spots as moments_of
-from groundproc.estimation.adjustment.datum import WIDEST_M, Datum, Spots, find_datum, reach_m
+from groundproc.estimation.adjustment.datum import Datum, find_datum, reach_m
 from groundproc.estimation.adjustment.factors import Factor, RowBuilder, Unknowns, cross
 from groundproc.estimation.adjustment.planes import placed
+from groundproc.estimation.adjustment.spots import WIDEST_M, Spots
 from groundproc.estimation.adjustment.surfaces import RADII_M, Near, Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.spline import Path
@@ -26,7 +27,6 @@ Array = npt.NDArray[np.float64]
 
 NAME: Final = "control"
 GATE_M: Final = 0.2
-AMBIGUOUS_M: Final = 0.3
 
 
 @dataclass(slots=True)

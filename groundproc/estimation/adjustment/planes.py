@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 from groundproc.estimation.adjustment.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.odometry import GROUND, observable
+from groundproc.estimation.odometry.matching import GROUND, observable
 from groundproc.estimation.odometry.spline import Path, PathArrays
 from groundproc.numerics.planerows import PlaneRows, RowArrays
 from groundproc.numerics.planes import Placed, VoxelPlanes, axes_along, find_planes, scatter_along

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from groundproc.estimation.adjustment.planes import RANGE_SIGMA_M, ROUGHNESS_M, placed
 from groundproc.estimation.odometry.clusters import Clusters
-from groundproc.estimation.odometry.odometry import GROUND
+from groundproc.estimation.odometry.matching import GROUND
 from groundproc.estimation.odometry.spline import Path
 from groundproc.numerics import robust
 from groundproc.numerics.planerows import HUBER

@@ -34,6 +34,7 @@ from groundproc.estimation.inertial.readings import (
     drives,
     standing,
 )
+from groundproc.estimation.inertial.transition import Motion
 from groundproc.numerics import robust
 from groundproc.numerics.rotations import quat_difference_outside, quat_multiply, quat_turned_by
 
@@ -309,7 +310,7 @@ def _smooth(
         frames.quat_multiply(first.quat[0], frames.quat_inverse(reference.quat[0]))
     )
     correction = np.empty((len(r.nodes_s), POSE))
-    motion = kalman.Motion(
+    motion = Motion(
         reference.position_m, reference.velocity_m_s, reference.quat, step_s, imu.rate * step_s[:, None], force * step_s[:, None],
         imu.rate_density, imu.force_density, r.gravity_m_s2, keep, drive,
     )  # fmt: skip

@@ -7,7 +7,9 @@ clusters    clusters of many slices, as columns
 voxels      a map of planes in a hash of voxels
 spline      the path of the sensor, and the spline that corrects it
 stated      positions and attitudes of the autopilot
-odometry    an iterated error-state filter; the causal mode
+state       where the sensor is, and how the inertial data carry that on
+matching    distances of clusters from the map, and the correction by them
+odometry    the two as an iterated error-state filter; the causal mode
 track       the forward pass: start, silent slices, fixes, loss of way
 beginning   the first seconds again, backwards
 """

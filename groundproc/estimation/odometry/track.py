@@ -14,9 +14,10 @@ from flightlog.errors import LogError
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import Motion
-from groundproc.estimation.odometry.odometry import Odometry, State, Step
+from groundproc.estimation.odometry.odometry import Odometry, Step
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Slice
 from groundproc.estimation.odometry.spline import Path, integrated, smooth_path
+from groundproc.estimation.odometry.state import State
 from groundproc.estimation.odometry.stated import Attitudes, Positions
 from groundproc.estimation.odometry.voxels import FLATNESS, NORMAL, MapArrays, PlaneMap, find
 from groundproc.numerics.voxelhash import spread, voxel_key

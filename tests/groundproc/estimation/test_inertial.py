@@ -24,6 +24,7 @@ from groundproc.estimation.inertial.model import (
     start_covariance,
 )
 from groundproc.estimation.inertial.readings import normal_gravity, pressure_height
+from groundproc.estimation.inertial.transition import Motion, backward_rows, forward_rows
 
 Array = npt.NDArray[np.float64]
 NODES, STEP_S, GRAVITY = 25, 0.05, 9.81
@@ -108,7 +109,7 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
         for name in ("_forward", "_record", "_back"):
             monkeypatch.setattr(kalman, name, getattr(kalman, name).py_func)
     keep = np.tile(KEEP, (NODES - 1, 1))
-    motion = kalman.Motion(*reference, np.full(NODES - 1, STEP_S), angle, push, *densities, GRAVITY, keep, drive)
+    motion = Motion(*reference, np.full(NODES - 1, STEP_S), angle, push, *densities, GRAVITY, keep, drive)
     out = kalman.Smoothed(1, correction, residual, kept, kept_covariance, variance)
     smooth(motion, kalman.Rows(first, *rows), start, covariance, out)
     # all states of all nodes as one Gaussian vector, conditioned on all measurements at once
@@ -146,8 +147,8 @@ def test_forward_and_backward_transitions_are_each_others_transposes() -> None:
     rng = np.random.default_rng(0)
     couple, keep = rng.standard_normal((5, 3)), rng.uniform(0.5, 1.0, 5)
     forward, backward = np.eye(STATES), np.eye(STATES)
-    kalman._forward_rows(forward, 0.3, couple, keep)
-    kalman._backward_rows(backward, 0.3, couple, keep)
+    forward_rows(forward, 0.3, couple, keep)
+    backward_rows(backward, 0.3, couple, keep)
     np.testing.assert_allclose(backward, forward.T, atol=1e-14)
 
 

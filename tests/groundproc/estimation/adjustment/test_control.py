@@ -12,9 +12,10 @@ from scipy import sparse
 from flightlog import frames
 from groundproc.estimation.adjustment.batch import Posterior, turned, whole_covariance
 from groundproc.estimation.adjustment.control import GATE_M, Held, control_report, control_warnings, held_to, spots_of
-from groundproc.estimation.adjustment.datum import Datum, Placing, find_datum
+from groundproc.estimation.adjustment.datum import Datum, find_datum
 from groundproc.estimation.adjustment.factors import Unknowns
 from groundproc.estimation.adjustment.solve import Wide
+from groundproc.estimation.adjustment.spots import Placing
 from groundproc.estimation.adjustment.surfaces import Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
