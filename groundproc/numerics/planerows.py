@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from groundproc.numerics.planes import Placed, VoxelPlanes, axes_along
+
 Array = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
@@ -93,6 +95,21 @@ class PlaneRows:
             self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.residual_m, self.inverse
         )
 
+    def lay(self, kept: Ints, placed: Placed, planes: VoxelPlanes, voxel_m: float) -> None:
+        """Set distances from the planes and places along them.
+
+        Parameters
+        ----------
+        kept : ndarray of int64, shape (n,)
+            Cluster of each row.
+        placed : Placed
+            All clusters.
+        planes : VoxelPlanes
+            Of the voxels that the rows have.
+        voxel_m : float
+        """
+        _lay(self.arrays, kept, placed.world_m, planes, voxel_m)
+
     def weigh(self, variance_m2: Array, roughness_m: float, cut: bool, voxel_m: float) -> None:
         """Set weights, and the planes that they make.
 
@@ -167,6 +184,20 @@ _NO_VECTOR: Final = np.empty((0, 6))
 def _prior(voxel_m: float) -> float:
     """Information of a plane's tilt before its rows, in voxels."""
     return float((voxel_m * TILT_PRIOR) ** -2.0)
+
+
+@njit(cache=True, nogil=True)
+def _lay(rows: RowArrays, kept: Ints, world: Array, planes: VoxelPlanes, voxel_m: float) -> None:
+    first, plane, residual, means = rows.first, rows.plane, rows.residual_m, planes.mean_m
+    for v in range(len(first) - 1):
+        nx, ny, nz = planes.normal[v]
+        ax, ay, az, bx, by, bz = axes_along(nx, ny, nz)
+        for i in range(first[v], first[v + 1]):
+            n = kept[i]
+            dx, dy, dz = world[n, 0] - means[v, 0], world[n, 1] - means[v, 1], world[n, 2] - means[v, 2]
+            residual[i] = nx * dx + ny * dy + nz * dz
+            plane[i, 0] = (ax * dx + ay * dy + az * dz) / voxel_m
+            plane[i, 1] = (bx * dx + by * dy + bz * dz) / voxel_m
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from numba import njit
 
 from flightlog import frames
 from groundproc.numerics.planerows import PlaneRows, RowArrays, solved_plane
-from groundproc.numerics.planes import Placed, VoxelPlanes, axes_along, find_planes, scatter_along
+from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
 from groundproc.numerics.voxelhash import voxel_key
 from groundproc.strips.correction import Correction
 
@@ -113,7 +113,8 @@ def bordered(
         np.empty((len(starts) - 1, 6)), kept, correction.intervals,
     )  # fmt: skip
     chosen, variance = VoxelPlanes(planes.normal[good], planes.mean_m[good], good[good]), np.empty(n)
-    _linearise(rows.arrays, kept, seen, _Arms(arm, control_sigma_m), chosen, voxel_m, variance)
+    rows.lay(kept, seen, chosen, voxel_m)
+    _linearise(rows.arrays, kept, seen, _Arms(arm, control_sigma_m), chosen.normal, variance)
     rows.weigh(variance, roughness_m, cut, voxel_m)
     return _with_constants(rows, quat[kept], constants)
 
@@ -238,26 +239,18 @@ def _take_planes(coefficients: Ints, sums: Array, inverse: Array, out: Array) ->
 
 
 @njit(cache=True, nogil=True)
-def _linearise(
-    rows: RowArrays, kept: Ints, seen: Placed, arms: _Arms, planes: VoxelPlanes, voxel_m: float, variance: Array
-) -> None:
-    """Fill in residuals, places along the planes and jacobians of rows, and the variance of each by its points [m^2].
+def _linearise(rows: RowArrays, kept: Ints, seen: Placed, arms: _Arms, normals: Array, variance: Array) -> None:
+    """Fill in jacobians of rows, and the variance of each by its points [m^2].
 
-    `kept` has the cluster of each row, `planes` the plane of each voxel that the rows have.
+    `kept` has the cluster of each row, `normals` are those of the voxels that the rows have.
     """
-    first, jacobian, plane, residual = rows.first, rows.jacobian, rows.plane, rows.residual_m
-    world, scatter, counts, arm, control = seen.world_m, seen.scatter_m2, seen.returns, arms.arm_m, arms.control_sigma_m
-    normals, means = planes.normal, planes.mean_m
+    first, jacobian = rows.first, rows.jacobian
+    scatter, counts, arm, control = seen.scatter_m2, seen.returns, arms.arm_m, arms.control_sigma_m
     for v in range(len(first) - 1):
         nx, ny, nz = normals[v]
-        ax, ay, az, bx, by, bz = axes_along(nx, ny, nz)
         across, spare = 4.0 * NOISE_M**2, 4.0
         for i in range(first[v], first[v + 1]):
             n = kept[i]
-            dx, dy, dz = world[n, 0] - means[v, 0], world[n, 1] - means[v, 1], world[n, 2] - means[v, 2]
-            residual[i] = nx * dx + ny * dy + nz * dz
-            plane[i, 0] = (ax * dx + ay * dy + az * dz) / voxel_m
-            plane[i, 1] = (bx * dx + by * dy + bz * dz) / voxel_m
             x, y, z = arm[n, 0], arm[n, 1], arm[n, 2]
             moves = 0.0 if control[n] > 0.0 else 1.0
             jacobian[i, 0], jacobian[i, 1] = moves * (y * nz - z * ny), moves * (z * nx - x * nz)

@@ -14,7 +14,7 @@ from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.matching import GROUND, observable
 from groundproc.estimation.odometry.spline import Path, PathArrays
 from groundproc.numerics.planerows import PlaneRows, RowArrays
-from groundproc.numerics.planes import Placed, VoxelPlanes, axes_along, find_planes, scatter_along
+from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.splines import basis
 from groundproc.numerics.voxelhash import assign, sorted_by, spread
@@ -116,7 +116,8 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     normals, variance = planes.normal[ids], np.empty(n)
     poses = _Poses(rotation, clusters.xyz_m)
     chosen = VoxelPlanes(normals, planes.mean_m[ids], planes.good[ids])
-    _linearise(rows.arrays, kept, seen, poses, chosen, voxel_m, variance)
+    rows.lay(kept, seen, chosen, voxel_m)
+    _linearise(rows.arrays, kept, seen, poses, normals, variance)
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
     rotation, xyz = rotation[kept], clusters.xyz_m[kept]
     del world, knot, weights, voxel, order, good, keep, seen, poses, variance  # a hundred bytes a cluster
@@ -337,25 +338,17 @@ def _choose(first: Ints, order: Ints, knot: Knots, planes: VoxelPlanes, interval
 
 
 @njit(cache=True, nogil=True)
-def _linearise(
-    rows: RowArrays, kept: Ints, seen: Placed, poses: _Poses, planes: VoxelPlanes, voxel_m: float, variance: Array
-) -> None:
-    """Fill in residuals, places along the planes and jacobians of rows, and the variance of each by its returns [m^2].
+def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: _Poses, normals: Array, variance: Array) -> None:
+    """Fill in jacobians of rows, and the variance of each by its returns [m^2].
 
-    `kept` has the cluster of each row, `planes` the plane of each voxel that the rows have.
+    `kept` has the cluster of each row, `normals` are those of the voxels that the rows have.
     """
-    first, jacobian, plane, residual = rows.first, rows.jacobian, rows.plane, rows.residual_m
-    world, scatter, counts, rotation, xyz = seen.world_m, seen.scatter_m2, seen.returns, poses.rotation, poses.xyz_m
-    normals, means = planes.normal, planes.mean_m
+    first, jacobian = rows.first, rows.jacobian
+    scatter, counts, rotation, xyz = seen.scatter_m2, seen.returns, poses.rotation, poses.xyz_m
     for v in range(len(first) - 1):
         nx, ny, nz = normals[v]
-        ax, ay, az, bx, by, bz = axes_along(nx, ny, nz)
         for i in range(first[v], first[v + 1]):
             n = kept[i]
-            dx, dy, dz = world[n, 0] - means[v, 0], world[n, 1] - means[v, 1], world[n, 2] - means[v, 2]
-            residual[i] = nx * dx + ny * dy + nz * dz
-            plane[i, 0] = (ax * dx + ay * dy + az * dz) / voxel_m
-            plane[i, 1] = (bx * dx + by * dy + bz * dz) / voxel_m
             r = rotation[n]
             p = nx * r[0] + ny * r[3] + nz * r[6]
             q = nx * r[1] + ny * r[4] + nz * r[7]
