@@ -4,7 +4,8 @@ It begins from the path and the clusters of `odometry`.
 
 planes      what the lidar says, with the planes solved for within; lasers: each laser's own offsets with them
 factors     what everything else says; anchors, outside: what ties the path to the earth
-control     surveyed points and planes; surfaces: the map where they lie; datum: the map laid on them as a whole
+control     surveyed points and planes; surfaces: the map where they lie
+datum       the map laid on them as a whole; spots: the places and how a map is placed; search: all that is within three sigma
 coarse      slow bends, the preconditioner's second level
 solve       one Gauss-Newton step by conjugate gradients
 noise       where errors come from, for the sigmas
