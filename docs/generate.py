@@ -1,9 +1,12 @@
 """Writes the pages that are tables of the programs, so that page and programs cannot differ.
 
 log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
-groundproc/products. Run it after a change of these: python docs/generate.py
+groundproc/products, the table in methods/observations.md from that of groundproc/estimation/observations. Run it after a change of these:
+python docs/generate.py
 """
 
+import importlib
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
@@ -12,6 +15,7 @@ from flightlog.records import FORMAT_VERSION, TABLE, RecordType
 from groundproc import products
 from groundproc.cloud import dimensions
 from groundproc.cloud.dimensions import Dimension
+from groundproc.estimation import observations
 
 DOCS: Final = Path(__file__).parent
 
@@ -172,8 +176,24 @@ def products_page() -> str:
     return _PRODUCTS + "\n".join(rows) + "\n"
 
 
+_KINDS: Final = re.compile(r"(<!-- kinds: [^\n]*-->\n).*?(<!-- end of kinds -->)", re.DOTALL)
+
+
+def observations_page() -> str:
+    """docs/methods/observations.md: the table of kinds within the page as it is."""
+    rows = ["| kind | what it is | adjustment | smoother |", "|---|---|---|---|"]
+    for name, path in observations.KINDS.items():
+        module = importlib.import_module(path)
+        used = ["yes" if hasattr(module, function) else "" for function in ("of_run", "of_leg")]
+        about = (module.__doc__ or "").partition("\n")[0]
+        rows.append(f"| `{name}` | {about} | {used[0]} | {used[1]} |")
+    before = (DOCS / "methods/observations.md").read_text(encoding="utf-8")
+    return _KINDS.sub(lambda found: found[1] + "\n".join(rows) + "\n" + found[2], before)
+
+
 PAGES: Final[dict[str, Callable[[], str]]] = {
     "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page,
+    "methods/observations.md": observations_page,
 }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ bad knot disturbs its two neighbours and nothing else.
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from numba import njit
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.geodesy import LocalFrame
+from groundproc.numerics.rotations import quat_difference, quat_turned
 from groundproc.trajectory.covariance import Correlation, chained, scaled, uncorrelated
 
 Array = npt.NDArray[np.float64]
@@ -108,19 +109,10 @@ class Trajectory:
         times = np.ascontiguousarray(time_ns, np.int64)
         position, quat = np.empty((len(times), 3)), np.empty((len(times), 4))
         covered = np.zeros(len(times), np.bool_)
-        _interpolate(
-            self.time_ns,
-            self.covered,
-            self.position_m,
-            self.velocity_m_s,
-            self.quat_local_ins_wxyz,
-            self.rate_rad_s,
-            self.interpolation == HOLD,
-            times,
-            position,
-            quat,
-            covered,
+        knots = _Knots(
+            self.time_ns, self.covered, self.position_m, self.velocity_m_s, self.quat_local_ins_wxyz, self.rate_rad_s
         )
+        _interpolate(knots, self.interpolation == HOLD, times, position, quat, covered)
         return Poses(position, quat), covered
 
     def at(self, time_ns: npt.NDArray[np.int64]) -> Poses:
@@ -207,20 +199,24 @@ def _correlation_of(parts: Sequence[Trajectory]) -> Correlation | None:
     )
 
 
+class _Knots(NamedTuple):
+    """Knots of a `Trajectory` as the kernel takes them; the fields stand there."""
+
+    time_ns: npt.NDArray[np.int64]
+    covered: npt.NDArray[np.bool_]
+    position_m: Array
+    velocity_m_s: Array
+    quat: Array
+    rate_rad_s: Array
+
+
 @njit(cache=True, nogil=True)
 def _interpolate(
-    knots: Any,
-    covered: Any,
-    position: Any,
-    velocity: Any,
-    quat: Any,
-    rate: Any,
-    hold: bool,
-    times: Any,
-    out_position: Any,
-    out_quat: Any,
-    out_covered: Any,
-) -> None:
+    trajectory: _Knots, hold: bool, times: npt.NDArray[np.int64], out_position: Array, out_quat: Array,
+    out_covered: npt.NDArray[np.bool_],
+) -> None:  # fmt: skip
+    knots, covered, quat, rate = trajectory.time_ns, trajectory.covered, trajectory.quat, trajectory.rate_rad_s
+    position, velocity = trajectory.position_m, trajectory.velocity_m_s
     last = len(knots) - 2
     i = -1
     delta, slope, vector = np.empty(3), np.empty(3), np.empty(3)
@@ -234,7 +230,7 @@ def _interpolate(
                 i += 1
             else:
                 i = min(max(np.searchsorted(knots, t, side="right") - 1, 0), last)
-            _relative_rotation(quat[i], quat[i + 1], delta)
+            quat_difference(quat[i], quat[i + 1], delta)
             # rate of the rotation vector at the end: the inverse right Jacobian, to second order in the step
             w = rate[i + 1]
             slope[0] = w[0] + 0.5 * (delta[1] * w[2] - delta[2] * w[1])
@@ -260,35 +256,4 @@ def _interpolate(
                 + h11 * velocity[i + 1, axis]
             )
             vector[axis] = h01 * delta[axis] + h10 * rate[i, axis] + h11 * slope[axis]
-        _rotate_on(quat[i], vector, out_quat[k])
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _relative_rotation(q: Any, r: Any, out: Any) -> None:
-    """Rotation vector from attitude q to attitude r, in the body of q: log(q^-1 r), the short way."""
-    w = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
-    x = q[0] * r[1] - q[1] * r[0] - q[2] * r[3] + q[3] * r[2]
-    y = q[0] * r[2] + q[1] * r[3] - q[2] * r[0] - q[3] * r[1]
-    z = q[0] * r[3] - q[1] * r[2] + q[2] * r[1] - q[3] * r[0]
-    sine = np.sqrt(x * x + y * y + z * z)
-    factor = 2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, abs(w)) / sine
-    if w < 0:
-        factor = -factor
-    out[0], out[1], out[2] = factor * x, factor * y, factor * z
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _rotate_on(q: Any, vector: Any, out: Any) -> None:
-    """Attitude q turned on by a rotation vector in its body: q exp(vector)."""
-    square = 0.25 * (vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    if square < 0.01:  # half angles under 0.1 rad: five terms are exact to 1e-16
-        w = 1 - square / 2 * (1 - square / 12 * (1 - square / 30 * (1 - square / 56)))
-        factor = 0.5 * (1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72))))
-    else:
-        half = np.sqrt(square)
-        w, factor = np.cos(half), 0.5 * np.sin(half) / half
-    x, y, z = factor * vector[0], factor * vector[1], factor * vector[2]
-    out[0] = q[0] * w - q[1] * x - q[2] * y - q[3] * z
-    out[1] = q[0] * x + q[1] * w + q[2] * z - q[3] * y
-    out[2] = q[0] * y - q[1] * z + q[2] * w + q[3] * x
-    out[3] = q[0] * z + q[1] * y - q[2] * x + q[3] * w
+        quat_turned(quat[i], vector[0], vector[1], vector[2], out_quat[k])

@@ -30,7 +30,8 @@ from groundproc.estimation.observations.observation import Observation, State
 from groundproc.estimation.observations.planes import Rows, placed, rows_of
 from groundproc.estimation.observations.rows import Factor, H, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.splines import basis
 from groundproc.trajectory.covariance import SIZE, Correlation
 
 Array = npt.NDArray[np.float64]

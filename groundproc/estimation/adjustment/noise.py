@@ -19,7 +19,8 @@ from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.observations.rows import PRIOR, Errors, Factor
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

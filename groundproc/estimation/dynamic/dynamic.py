@@ -21,6 +21,7 @@ from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
 from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
 from groundproc.estimation.method import Given, Method, Progress
+from groundproc.numerics import robust
 from groundproc.sensors.hdl32e import Gate
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
@@ -134,9 +135,7 @@ def _report(trims: Trims, ratio: float, curve: CompassCurve | None) -> dict[str,
             name: {"median": float(np.median(v)), "least": float(v.min()), "largest": float(v.max())}
             for name, v in _named(trims.values).items()
         },
-        "yaw_scatter_deg": float(1.4826 * np.median(np.abs(np.diff(yaw_deg[::10])))) / np.sqrt(2)
-        if len(yaw_deg) > 20
-        else None,
+        "yaw_scatter_deg": robust.sigma(np.diff(yaw_deg[::10]), 0.0) / np.sqrt(2) if len(yaw_deg) > 20 else None,
         "course": courses.compare(trims.values[:, YAW], trims.course_rad),
         "compass": None if curve is None else {"runs": curve.runs, "scatter_deg": curve.scatter_deg},
     }

@@ -2,6 +2,7 @@
 
 imu           the autopilot's gyros and accelerometers and the lidar's made into one IMU on one grid of time
 readings      what one boot of the autopilot and the lidar beside it measured
+transition    the step of the states from node to node
 kalman        Kalman filter and backward smoother: one Gauss-Newton step over the whole flight
 solution      the iteration: linearise, smooth, learn the noise, again
 

@@ -18,6 +18,7 @@ from groundproc.estimation.inertial.readings import (
     drives,
     standing,
 )
+from groundproc.estimation.inertial.transition import Motion
 from groundproc.estimation.method import Given
 from groundproc.estimation.observations import measured_of
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Reference, Rows, System
@@ -38,6 +39,8 @@ from groundproc.estimation.observations.states import (
     start_covariance,
 )
 from groundproc.flight.timeline import Leg
+from groundproc.numerics import robust
+from groundproc.numerics.rotations import quat_difference_outside, quat_multiply, quat_turned_by
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -180,7 +183,7 @@ def solve(
         if iteration < ITERATIONS:
             if iteration <= 3:
                 model = _learnt(model, noise, system, residual, states, spread)
-            weight = 1.0 / (1.0 + np.square(residual / _noise(noise, system, model) / OUTLIER))
+            weight = robust.cauchy(residual / _noise(noise, system, model) / OUTLIER)
     return _solution(
         readings,
         model,
@@ -246,29 +249,25 @@ def _start(r: Readings, imu: _Imu) -> Reference:
 
 
 @njit(cache=True, nogil=True)
-def _join(angle: Any, place: Any, given: Any, out: Any) -> None:
+def _join(angle: Array, place: npt.NDArray[np.int64], given: Array, out: Array) -> None:
     """Attitudes on nodes: turned on from each given one by the gyros, what is missed at the next one spread evenly before it."""
     nodes = len(out)
-    missed, part, unit, turned = np.empty(3), np.empty(4), np.array([1.0, 0.0, 0.0, 0.0]), np.empty(4)
+    missed, part, unit = np.empty(3), np.empty(4), np.array([1.0, 0.0, 0.0, 0.0])
     out[place[0]] = given[0]
     for k in range(place[0] - 1, -1, -1):
-        kalman.turn_on(out[k + 1], angle[k], -1.0, out[k])
+        quat_turned_by(out[k + 1], angle[k], -1.0, out[k])
     for i in range(len(place)):
         low = place[i]
         high = place[i + 1] if i + 1 < len(place) else nodes - 1
         out[low] = given[i]
         for k in range(low, high):
-            kalman.turn_on(out[k], angle[k], 1.0, out[k + 1])
+            quat_turned_by(out[k], angle[k], 1.0, out[k + 1])
         if i + 1 == len(place):
             break
-        kalman.turned_between(given[i + 1], out[high], missed)
+        quat_difference_outside(given[i + 1], out[high], missed)
         for k in range(low + 1, high):
-            kalman.turn_on(unit, missed, (k - low) / (high - low), part)
-            turned[:] = out[k]
-            out[k, 0] = part[0] * turned[0] - part[1] * turned[1] - part[2] * turned[2] - part[3] * turned[3]
-            out[k, 1] = part[0] * turned[1] + part[1] * turned[0] + part[2] * turned[3] - part[3] * turned[2]
-            out[k, 2] = part[0] * turned[2] - part[1] * turned[3] + part[2] * turned[0] + part[3] * turned[1]
-            out[k, 3] = part[0] * turned[3] + part[1] * turned[2] - part[2] * turned[1] + part[3] * turned[0]
+            quat_turned_by(unit, missed, (k - low) / (high - low), part)
+            quat_multiply(part, out[k], out[k])
 
 
 def _smooth(
@@ -321,22 +320,17 @@ def _smooth(
         frames.quat_multiply(first.quat[0], frames.quat_inverse(reference.quat[0]))
     )
     correction = np.empty((len(r.nodes_s), POSE))
+    motion = Motion(
+        reference.position_m, reference.velocity_m_s, reference.quat, step_s, imu.rate * step_s[:, None], force * step_s[:, None],
+        imu.rate_density, imu.force_density, r.gravity_m_s2, keep, drive,
+    )  # fmt: skip
+    out = kalman.Smoothed(stride, correction, residual, states, covariance, spread)
     kalman.smooth(
-        (reference.position_m, reference.velocity_m_s, reference.quat),
-        (step_s, imu.rate * step_s[:, None], force * step_s[:, None], imu.rate_density, imu.force_density),
-        r.gravity_m_s2,
-        keep,
-        drive,
-        system.first,
-        system.rows(),
+        motion,
+        kalman.Rows(system.first, system.count, system.index, system.value, system.measured, system.variance),
         start,
         start_covariance(model, fix_sigma, r.linked),
-        stride,
-        correction,
-        residual,
-        states,
-        covariance,
-        spread,
+        out,
     )
     return correction
 
@@ -374,7 +368,7 @@ def _learnt(
     for kind, each in noise.items():
         chosen = residual[system.of(kind)]
         if len(chosen) >= 50:
-            changed[each.field] = float(np.clip(1.4826 * np.median(np.abs(chosen)), each.least, each.most))
+            changed[each.field] = float(np.clip(robust.sigma(chosen, 0.0), each.least, each.most))
     for name, part, least, most in (
         ("tilt_rad", slice(TILT, TILT + 2), np.deg2rad(0.2), np.deg2rad(10.0)),
         ("heading_rad", slice(HEADING, HEADING + 1), np.deg2rad(0.3), np.deg2rad(20.0)),

@@ -13,10 +13,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.observations.datum import WIDEST_M, Datum, Spots, find_datum, reach_m
+from groundproc.estimation.observations.datum import Datum, find_datum, reach_m
 from groundproc.estimation.observations.moments import spots as moments_of
 from groundproc.estimation.observations.planes import placed
 from groundproc.estimation.observations.rows import Factor, RowBuilder, Unknowns, cross
+from groundproc.estimation.observations.spots import WIDEST_M, Spots
 from groundproc.estimation.observations.surfaces import RADII_M, Near, Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.spline import Path
@@ -26,7 +27,6 @@ Array = npt.NDArray[np.float64]
 
 NAME: Final = "control"
 GATE_M: Final = 0.2
-AMBIGUOUS_M: Final = 0.3
 
 
 @dataclass(slots=True)

@@ -5,13 +5,14 @@ the planes are solved for within as before (`planes`); what couples lasers and p
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from flightlog.hdl32e import LASERS
+from groundproc.numerics.planerows import RowArrays, solved_plane
 from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import LaserCorrections
 
@@ -29,6 +30,13 @@ STRETCH: Final = 2.0
 the others."""
 KNOWN: Final = 0.5
 """An offset counts as found where its sigma is below this share of what was known before."""
+
+
+class LaserArrays(NamedTuple):
+    """Laser of each row and what its distance changes by, as kernels take them; see `LaserColumns`."""
+
+    laser: npt.NDArray[np.int32]
+    change: npt.NDArray[np.float32]
 
 
 @dataclass(slots=True)
@@ -51,6 +59,11 @@ class LaserColumns:
     change: npt.NDArray[np.float32]
     border: Array
     corner: Array
+
+    @property
+    def arrays(self) -> LaserArrays:
+        """What the kernels take."""
+        return LaserArrays(self.laser, self.change)
 
     def along(self, corrections: Array) -> Array:
         """The rows times corrections, shape (UNKNOWNS,): shape (n,)."""
@@ -178,23 +191,22 @@ def shifted(xyz_m: npt.NDArray[np.float32], laser: npt.NDArray[np.int32], change
 
 
 @njit(cache=True, nogil=True)
-def border_of(
-    first: Any, knot: Any, weights: Any, jacobian: Any, plane: Any, weight: Any, inverse: Any, laser: Any, change: Any, border: Any,
-    corner: Any,
-) -> None:  # fmt: skip
+def border_of(rows: RowArrays, lasers: LaserArrays, border: Array, corner: Array) -> None:
     """Normal matrix of corrections and path, and of the corrections alone, planes solved for within; added to the two last."""
-    wide = change.shape[1] * LASERS
+    first, knot, inverse = rows.first, rows.knot, rows.inverse
+    wide = lasers.change.shape[1] * LASERS
     place, active = np.full(wide, -1, np.int64), np.empty(wide, np.int64)
     sums, off, gathered = np.zeros((wide, 3)), np.zeros((wide, 3)), np.zeros((24, 3))
     for v in range(len(first) - 1):
-        count = _sums(first[v], first[v + 1], plane, weight, laser, change, place, active, sums)
-        _solved(inverse[v], sums[:count], off)
+        count = _sums(v, rows, lasers, place, active, sums)
+        for a in range(count):
+            off[a, 0], off[a, 1], off[a, 2] = solved_plane(inverse[v], sums[a, 0], sums[a, 1], sums[a, 2])
         for a in range(count):
             for b in range(count):
                 corner[active[a], active[b]] -= sums[a, 0] * off[b, 0] + sums[a, 1] * off[b, 1] + sums[a, 2] * off[b, 2]
         for i in range(first[v], first[v + 1]):
-            _own(i, knot[i], weights, jacobian, weight[i], laser[i], change, border, corner)
-            _gather(i, weights, jacobian, plane, weight[i], gathered)
+            _own(i, rows, lasers, border, corner)
+            _gather(i, rows, gathered)
             # rows of one voxel are in order of time: all of a slice at once
             if i + 1 == first[v + 1] or knot[i + 1] != knot[i]:
                 _take_off(active[:count], off, gathered, 6 * knot[i], border)
@@ -203,12 +215,11 @@ def border_of(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _sums(
-    start: int, end: int, plane: Any, weight: Any, laser: Any, change: Any, place: Any, active: Any, sums: Any
-) -> Any:
+def _sums(v: int, rows: RowArrays, lasers: LaserArrays, place: Ints, active: Ints, sums: Array) -> Any:
     """For each column that a voxel has (`active`, found by `place`) its weighed sums along the plane; returns how many there are."""
+    plane, weight, laser, change = rows.plane, rows.weight, lasers.laser, lasers.change
     count = 0
-    for i in range(start, end):
+    for i in range(rows.first[v], rows.first[v + 1]):
         for c in range(change.shape[1]):
             column = c * LASERS + laser[i]
             if place[column] < 0:
@@ -224,42 +235,33 @@ def _sums(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _solved(q: Any, sums: Any, off: Any) -> None:
-    """The plane that each column's sums make, by the inverse of its normal matrix."""
-    for a in range(len(sums)):
-        s0, s1, s2 = sums[a, 0], sums[a, 1], sums[a, 2]
-        off[a, 0] = q[0] * s0 + q[1] * s1 + q[2] * s2
-        off[a, 1] = q[1] * s0 + q[3] * s1 + q[4] * s2
-        off[a, 2] = q[2] * s0 + q[4] * s1 + q[5] * s2
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _own(
-    i: int, k: int, weights: Any, jacobian: Any, weight: float, laser: int, change: Any, border: Any, corner: Any
-) -> None:
+def _own(i: int, rows: RowArrays, lasers: LaserArrays, border: Array, corner: Array) -> None:
     """A row's own product with its pose and its laser."""
-    for c in range(change.shape[1]):
-        column, pull = c * LASERS + laser, weight * change[i, c]
-        for b in range(change.shape[1]):
-            corner[column, b * LASERS + laser] += pull * change[i, b]
+    k, laser, change = rows.knot[i], lasers.laser[i], lasers.change[i]
+    weights, jacobian = rows.weights[i], rows.jacobian[i]
+    for c in range(len(change)):
+        column, pull = c * LASERS + laser, rows.weight[i] * change[c]
+        for b in range(len(change)):
+            corner[column, b * LASERS + laser] += pull * change[b]
         for j in range(4):
             for e in range(6):
-                border[column, 6 * (k + j) + e] += pull * weights[i, j] * jacobian[i, e]
+                border[column, 6 * (k + j) + e] += pull * weights[j] * jacobian[e]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _gather(i: int, weights: Any, jacobian: Any, plane: Any, weight: float, gathered: Any) -> None:
+def _gather(i: int, rows: RowArrays, gathered: Array) -> None:
     """Add a row's product with its pose and its plane."""
+    weights, jacobian, plane, weight = rows.weights[i], rows.jacobian[i], rows.plane[i], rows.weight[i]
     for j in range(4):
         for e in range(6):
-            pull = weight * weights[i, j] * jacobian[i, e]
+            pull = weight * weights[j] * jacobian[e]
             gathered[6 * j + e, 0] += pull
-            gathered[6 * j + e, 1] += pull * plane[i, 0]
-            gathered[6 * j + e, 2] += pull * plane[i, 1]
+            gathered[6 * j + e, 1] += pull * plane[0]
+            gathered[6 * j + e, 2] += pull * plane[1]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _take_off(active: Any, off: Any, gathered: Any, start: int, border: Any) -> None:
+def _take_off(active: Ints, off: Array, gathered: Array, start: int, border: Array) -> None:
     """Take what the plane takes off a slice's products, and begin anew."""
     for a in range(len(active)):
         for j in range(24):

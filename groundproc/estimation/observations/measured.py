@@ -239,10 +239,6 @@ class System:
     kind: npt.NDArray[np.int8]
     kinds: tuple[str, ...]
 
-    def rows(self) -> tuple[Any, ...]:
-        """As the filter takes them."""
-        return self.count, self.index, self.value, self.measured, self.variance
-
     def of(self, kind: str) -> Mask:
         """Which rows are of a kind, shape (m,)."""
         return np.asarray(self.kind == self.kinds.index(kind)) if kind in self.kinds else np.zeros(len(self.kind), bool)

@@ -6,7 +6,8 @@ import numpy.typing as npt
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -26,6 +26,7 @@ from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.positions.solution import Quality
 from groundproc.flight.timebase import UtcTie
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -336,7 +337,7 @@ def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: 
     centred = residual - np.median(residual, axis=0)
     distance = np.linalg.norm(np.linalg.solve(spread, centred[:, :, None])[:, :, 0], axis=1)
     usual = OUTLIER * max(1.0, float(np.median(distance)) / MEDIAN_DISTANCE[residual.shape[1]])
-    share = np.minimum(1.0, usual / np.maximum(distance, 1e-12))
+    share = robust.huber(distance, usual)
     white = np.linalg.inv(spread) * np.sqrt(share / inflation)[:, None, None]
     blocks = sparse.block_diag(white, format="csr")
     return Factor(

@@ -19,6 +19,7 @@ from groundproc.estimation.observations.observation import Observation, Outcome,
 from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, cross
 from groundproc.estimation.observations.source import Arm, Clock
 from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -184,7 +185,7 @@ def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: 
     spread = np.linalg.cholesky(covariance)
     distance = np.linalg.norm(np.linalg.solve(spread, residual[:, :, None])[:, :, 0], axis=1)
     usual = OUTLIER * max(1.0, float(np.median(distance)) / MEDIAN_DISTANCE)
-    share = np.minimum(1.0, usual / np.maximum(distance, 1e-12))
+    share = robust.huber(distance, usual)
     white = sparse.block_diag(np.linalg.inv(spread) * np.sqrt(share)[:, None, None], format="csr")
     return Factor(
         name, white @ residual.ravel(), (white @ matrix).tocsr(), np.ones(residual.size), errors=Errors.LASTING

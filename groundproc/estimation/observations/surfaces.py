@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from groundproc.estimation.observations.planes import HUBER, RANGE_SIGMA_M, ROUGHNESS_M, placed
+from groundproc.estimation.observations.planes import RANGE_SIGMA_M, ROUGHNESS_M, placed
 from groundproc.estimation.odometry.clusters import Clusters
-from groundproc.estimation.odometry.odometry import GROUND
+from groundproc.estimation.odometry.matching import GROUND
 from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics import robust
+from groundproc.numerics.planerows import HUBER
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -222,7 +224,7 @@ def _made(seen: Near, rows: Index, normal: Array, place: Array, radius: float, d
         shares = (columns * weight[:, None]) @ inverse[0]
         plane = inverse @ (columns.T @ (weight * distance))
         off_plane = np.abs(distance - columns @ plane) * np.sqrt(whole)
-        weight = whole * np.minimum(1.0, HUBER / np.maximum(off_plane, 1e-9))
+        weight = whole * robust.huber(off_plane, HUBER)
     ground = z > GROUND
     scale = 1.0 / z if ground else 1.0
     # a place has the relief that the clusters have about their plane

@@ -10,6 +10,7 @@ from groundproc.estimation.observations.rows import H
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack, on_grid
 from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 
@@ -83,8 +84,4 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
 
 def robust_sigma(residual: Array, least: float) -> float:
     """Standard deviation from the median absolute deviation."""
-    return (
-        max(float(1.4826 * np.median(np.abs(residual - np.median(residual, axis=0)))), least)
-        if len(residual)
-        else least
-    )
+    return max(robust.sigma(residual, np.median(residual, axis=0)), least) if len(residual) else least

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from flightlog.errors import SwathError
 from groundproc.cloud.gpstime import Clock
-from groundproc.estimation.observations.planes import TILT_PRIOR
 from groundproc.estimation.observations.rows import Unknowns
 from groundproc.geodesy import projected_crs
+from groundproc.numerics.planerows import TILT_PRIOR
 from groundproc.strips.adjust import Linear, Sigmas, constant_prior, wandering
 from groundproc.strips.clouds import chunks, look
 from groundproc.strips.clusters import CLUSTER, Gatherer

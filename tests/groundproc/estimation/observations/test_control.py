@@ -13,9 +13,10 @@ from flightlog import frames
 from groundproc.estimation.adjustment.posterior import Posterior, whole_covariance
 from groundproc.estimation.adjustment.solve import Wide
 from groundproc.estimation.observations.control import control_report, control_warnings
-from groundproc.estimation.observations.datum import Datum, Placing, find_datum
+from groundproc.estimation.observations.datum import Datum, find_datum
 from groundproc.estimation.observations.held import GATE_M, Held, held_to, spots_of
 from groundproc.estimation.observations.rows import Unknowns, turned
+from groundproc.estimation.observations.spots import Placing
 from groundproc.estimation.observations.surfaces import Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS

@@ -5,10 +5,12 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from groundproc.estimation.observations.planes import TILT_PRIOR, Rows, rows_of
+from groundproc.estimation.observations.planes import Rows, rows_of
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.planerows import TILT_PRIOR
+from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 8
