@@ -37,8 +37,7 @@ from groundproc.accuracy.alignment import align
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
 from groundproc.cloud.georeference import georeference
 from groundproc.cloud.placing import Tally, chunks
-from groundproc.estimation import methods
-from groundproc.estimation.dynamic.options import ROBUST, SOURCE, DynamicOptions
+from groundproc.estimation import direct
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import Found, Search
 from groundproc.estimation.dynamic.trims import applied, interpolated
@@ -48,6 +47,7 @@ from groundproc.flight.mounting import find_mount
 from groundproc.flight.timeline import Leg, legs
 from groundproc.sensors.hdl32e import Gate
 from groundproc.survey import Survey
+from groundproc.survey.dynamic import ROBUST, SOURCE, DynamicOptions
 from groundproc.trajectory.trajectory import Trajectory
 
 mpl.use("Agg")
@@ -112,7 +112,7 @@ def cloud(
         kept = points.time_ns // FIRING_NS % EVERY == 0
         places.append(points.xyz_m[kept])
         times.append(points.time_ns[kept])
-        lasers.append(points.laser[kept])
+        lasers.append(points["laser"][kept])
     time_ns = np.concatenate(times)
     keys = (time_ns - given.readers[0].start_ns) * LASERS + np.concatenate(lasers)
     return np.concatenate(places), time_ns, keys
@@ -177,7 +177,7 @@ def experiment(name: str, folder: Path, results: Path) -> dict[str, Any]:
         flight = read_flight([reader], "ins")
         timeline: list[Leg] = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), survey.sync)
         given = gather([reader], flight, timeline, mount, survey)
-        start = methods.ins_estimate(given, lambda *_: None).trajectory
+        start = direct.ins_estimate(given, lambda *_: None).trajectory
         none = np.empty(0, np.int64)
         made = {
             "ins": Made(start, none, np.empty(0), None),

@@ -7,9 +7,10 @@ import numpy as np
 from flightlog import hdl32e, records
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import Motion
-from groundproc.estimation.odometry.odometry import Odometry, State
+from groundproc.estimation.odometry.odometry import Odometry
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.spline import Path, integrated
+from groundproc.estimation.odometry.state import State
 from groundproc.geodesy import LocalFrame
 from groundproc.live.motion import GrowingMotion
 from groundproc.live.slicer import Slicer

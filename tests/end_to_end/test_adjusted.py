@@ -16,11 +16,12 @@ from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
 from groundproc.estimation.adjustment import adjusted, windows
-from groundproc.estimation.method import Estimate, gather
+from groundproc.estimation.method import gather
 from groundproc.estimation.odometry.track import Track
 from groundproc.flight.flight import read_flight
 from groundproc.flight.timeline import legs
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 SECONDS = 20.0
 DRAWS = 12

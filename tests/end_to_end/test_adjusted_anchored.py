@@ -20,10 +20,11 @@ from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
 from groundproc.cli import main
 from groundproc.estimation import methods
 from groundproc.estimation.adjustment import adjusted, windows
-from groundproc.estimation.method import Estimate, Given, gather
+from groundproc.estimation.method import Given, gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.timeline import legs
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 Array = npt.NDArray[np.float64]
 SECONDS = 20.0

@@ -17,11 +17,12 @@ from groundproc.cli import main
 from groundproc.estimation import methods
 from groundproc.estimation.calibration.compass import BINS, read_compass
 from groundproc.estimation.dynamic.dynamic import with_compass
-from groundproc.estimation.method import Estimate, gather
+from groundproc.estimation.method import gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.timeline import legs
 from groundproc.sensors.lasers import ESTIMATE, read_lasers
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 SECONDS = 20.0
 

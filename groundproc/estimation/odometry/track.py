@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,12 @@ from flightlog.errors import LogError
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import Motion
-from groundproc.estimation.odometry.odometry import Odometry, State, Step
+from groundproc.estimation.odometry.odometry import Odometry, Step
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Slice
 from groundproc.estimation.odometry.spline import Path, integrated, smooth_path
+from groundproc.estimation.odometry.state import State
 from groundproc.estimation.odometry.stated import Attitudes, Positions
-from groundproc.estimation.odometry.voxels import FLATNESS, NORMAL, PlaneMap, find
+from groundproc.estimation.odometry.voxels import FLATNESS, NORMAL, MapArrays, PlaneMap, find
 from groundproc.numerics.voxelhash import spread, voxel_key
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -393,7 +394,7 @@ def thinned(clusters: npt.NDArray[np.void], world_m: Array, planes: PlaneMap, mo
     if len(clusters) <= most:
         return clusters
     kind, draw = np.empty(len(clusters), np.int64), np.empty(len(clusters))
-    _sort_out(world_m, planes.table, planes.keys, planes.voxels, planes.voxel_m, kind, draw)
+    _sort_out(world_m, planes.arrays, kind, draw)
     counts = np.bincount(kind, minlength=3)
     share = even_shares(counts, most)
     return clusters[draw < share[kind]]
@@ -410,7 +411,8 @@ def even_shares(counts: Sequence[int] | npt.NDArray[np.int64], most: int) -> Arr
 
 
 @njit(cache=True, nogil=True)
-def _sort_out(world: Any, table: Any, keys: Any, voxels: Any, voxel_m: float, kind: Any, draw: Any) -> None:
+def _sort_out(world: Array, planes: MapArrays, kind: Ints, draw: Array) -> None:
+    table, keys, voxels, voxel_m = planes
     for n in range(len(world)):
         key = voxel_key(world[n, 0], world[n, 1], world[n, 2], 1.0 / voxel_m)
         row = find(table, keys, key)

@@ -1,0 +1,86 @@
+"""Step place: every shot given its time and pose, projected, and handed to the products."""
+
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from flightlog.hdl32e import RANGE_LSB_M
+from groundproc import geodesy
+from groundproc.cloud import placing
+from groundproc.flight.timeline import tied
+from groundproc.geodesy import LocalFrame
+from groundproc.products import chosen, plain
+from groundproc.products.product import Context, streamed
+from groundproc.sensors.hdl32e import Gate
+from groundproc.steps.ledger import INSIDE
+from groundproc.steps.run import Run
+from groundproc.steps.step import Request, Step
+from groundproc.survey import PlacingSettings, Survey, section
+
+FOUND: Final = f"{INSIDE}/place.json"
+"""What quality.json says of shots and points."""
+
+
+def settings(request: Request) -> Mapping[str, Any]:
+    """The window of shots, the CRS, what heights refer to, and the products that take points."""
+    survey = request.survey
+    products = plain(each for each in chosen(survey.products) if each.takes_points)
+    return section(survey, PlacingSettings) | {"crs": survey.crs, "height": survey.height, "products": products}
+
+
+def check(request: Request) -> None:
+    """Refuse a wrong code and a product that there is not before the work, not after."""
+    chosen(request.survey.products)
+    if request.survey.crs is not None:
+        geodesy.projected_crs(request.survey.crs)
+
+
+def projection_of(frame: LocalFrame, survey: Survey) -> geodesy.Projection:
+    """Into the survey's CRS, or the UTM zone of the frame's origin."""
+    code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    return geodesy.Projection(frame, geodesy.projected_crs(code))
+
+
+def work(run: Run, folder: Path) -> None:
+    """Place the points and finish the products that are made of them."""
+    made = run.estimate
+    timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
+    projection = projection_of(made.trajectory.frame, run.survey)
+    survey, tally = run.survey, placing.Tally()
+    context = Context(folder, run.folder, survey, made, projection, inputs=run.names)
+    packets = placing.chunks(run.readers, timeline, tally, functools.partial(run.progress, "place"))
+    gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
+    with streamed(chosen(survey.products), context) as sinks:
+        placed = placing.place(packets, made.trajectory, made.mount, projection, sinks, gate=gate, lasers=made.lasers)
+    found = {
+        "crs": {"epsg": projection.crs.to_epsg(), "name": projection.crs.name},
+        "lidar": {
+            "packets": tally.packets,
+            "packets_outside_every_leg": tally.packets_without_leg,
+            "aboard": {
+                "masked_packets": tally.masked_packets,
+                "masked_blocks": tally.masked_blocks,
+                "kernel_drops": tally.kernel_drops,
+                "queue_drops": tally.queue_drops,
+                "rejected": tally.rejected,
+            },
+        },
+        "points": {"written": placed.points, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(placed.dropped)},
+    }
+    path = folder / FOUND
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+STEP: Final = Step(
+    name="place",
+    about="points, and the products made of them",
+    after=("trajectory",),
+    reads_logs=True,
+    settings=settings,
+    work=work,
+    check=check,
+)

@@ -1,0 +1,87 @@
+"""What a step is: what it reads, the settings it looks at, what it makes."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flightlog import config
+from groundproc.sensors.lasers import ESTIMATE
+from groundproc.steps import ORDER
+from groundproc.survey import FILES, Survey
+
+if TYPE_CHECKING:
+    from groundproc.steps.run import Run
+
+Key = dict[str, Any]
+"""What decides about a step's outcome, as plain values: a step whose key is as it was need not run again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the user asks for.
+
+    Attributes
+    ----------
+    logs : sequence of Path
+        One or several logs of one flight.
+    survey : Survey
+        With the paths in it absolute or relative to the working directory.
+    poses : Path or None
+        A trajectory made before, to place the points with: an estimate's folder or a trajectory.csv.
+    """
+
+    logs: Sequence[Path]
+    survey: Survey
+    poses: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step from logs to products.
+
+    Attributes
+    ----------
+    name : str
+        That of its module, of `--until` and of the ledger.
+    about : str
+        What it makes, for people.
+    after : tuple of str
+        Steps whose outputs it reads.
+    reads_logs : bool
+    settings : callable
+        The settings it looks at, by name, as plain values; a change of any other does not concern it. Files that settings name stand
+        under `files`.
+    files : callable
+        Files beside the logs that it reads, by the name of the setting.
+    work : callable
+        Writes the outputs into a folder that is given: all of its files are outputs, whatever their names.
+    check : callable
+        Refuses what cannot be before any step begins.
+    """
+
+    name: str
+    about: str
+    after: tuple[str, ...]
+    reads_logs: bool
+    settings: Callable[[Request], Mapping[str, Any]]
+    work: "Callable[[Run, Path], None]"
+    files: Callable[[Request], Mapping[str, Path]] = lambda request: {}
+    check: Callable[[Request], None] = lambda request: None
+
+
+def steps() -> list[Step]:
+    """All steps, in the order of the flight."""
+    return [import_module(f"groundproc.steps.{name}").STEP for name in ORDER]
+
+
+def absolute(survey: Survey) -> Survey:
+    """A survey whose names of files hold from everywhere."""
+    tree = config.to_mapping(survey)
+    for name in FILES:
+        if isinstance(tree[name], str) and tree[name] != ESTIMATE:
+            tree[name] = str(Path(tree[name]).resolve())
+    if isinstance(tree["geoid"], str) and Path(tree["geoid"]).is_file():
+        tree["geoid"] = str(Path(tree["geoid"]).resolve())
+    return config.from_mapping(tree, Survey, "survey")
