@@ -1,12 +1,9 @@
 """Compiles or loads every kernel before the first packet, so that none of them makes the flight wait."""
 
-from typing import cast
-
 import numpy as np
 
 from flightlog import hdl32e, records
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
-from groundproc.estimation.odometry.motion import Motion
 from groundproc.estimation.odometry.odometry import Odometry, State
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.spline import Path, integrated
@@ -27,7 +24,7 @@ def warm_up() -> None:
     state = State(
         np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), gravity, 1e-4 * np.eye(18)
     )
-    odometry = Odometry(state, cast(Motion, motion), 0, 0.5)
+    odometry = Odometry(state, motion, 0, 0.5)
     side = np.linspace(1.0, 5.0, 60)
     floor = np.stack([*np.meshgrid(side, side), np.full((60, 60), -2.0)], axis=-1).reshape(-1, 3).astype(np.float32)
     for number in range(3):

@@ -43,8 +43,9 @@ from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack, Motion, base_motion, on_grid
 from groundproc.estimation.odometry.slices import Slice, slices
 from groundproc.estimation.odometry.spline import Path
-from groundproc.estimation.odometry.stated import Attitudes, Positions
-from groundproc.estimation.odometry.track import Track, Tracker, grid_ns, tracked
+from groundproc.estimation.odometry.stated import Attitudes, Positions, Recorded
+from groundproc.estimation.odometry.track import Track, grid_ns
+from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.estimation.surveyed import surveyed, surveyed_control
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg
@@ -436,16 +437,8 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
     motion, own, other = base_motion(given, legs[0], given.flight.runs[number])
     positions = position_track(given, legs[0])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    tracker = Tracker(
-        motion,
-        start,
-        mat,
-        lever,
-        gyro_offset(motion, own, other),
-        positions,
-        keep=False,
-        attitudes=attitude_track(legs[0]),
-    )
+    stated = Recorded(positions, attitude_track(legs[0]))
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, keep=False)
     for piece in slices(given, motion.start_ns, progress):
         tracker.feed(piece)
     track = tracked(tracker)
@@ -477,10 +470,8 @@ def adjust_run(
         given.survey.lasers == ESTIMATE,
         surveyed_control(given),
     )
-    tracker = Tracker(
-        motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
-        attitudes=sources.attitudes[0] if sources.attitudes else None,
-    )  # fmt: skip
+    stated = Recorded(sources.positions[0], sources.attitudes[0] if sources.attitudes else None)
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated)
     pace = Pace(progress)
     windows: list[Window] = []
     begin = 0

@@ -15,7 +15,7 @@ from numba import njit
 
 from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
-from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.motion import MotionGrid
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
 from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, TILT, PlaneMap, find
 from groundproc.numerics.rotations import mat_of_quat, quat_difference, quat_turned, unit_vector
@@ -106,7 +106,7 @@ class Odometry:
     ----------
     state : State
         At the start of slice `number`.
-    motion : Motion
+    motion : MotionGrid
     number : int
     voxel_m : float
         Edge of the map's voxels.
@@ -117,7 +117,7 @@ class Odometry:
     REACH_M: Final = 250.0
     """The map forgets what lies farther away than this."""
 
-    def __init__(self, state: State, motion: Motion, number: int, voxel_m: float) -> None:
+    def __init__(self, state: State, motion: MotionGrid, number: int, voxel_m: float) -> None:
         self.state, self.number, self.voxel_m = state, number, voxel_m
         self._motion = motion
         self.map = PlaneMap(voxel_m)
