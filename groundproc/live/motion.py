@@ -84,7 +84,7 @@ def white_noise(samples: Array) -> float:
 
 
 class GrowingMotion:
-    """What `groundproc.estimation.adjustment.motion.Motion` is, for a flight that goes on.
+    """A `MotionGrid` that grows: the motion of a flight that goes on.
 
     Parameters
     ----------

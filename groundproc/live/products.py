@@ -14,7 +14,7 @@ from groundproc.cloud.writer import CloudWriter, round_origin_m
 from groundproc.files import written_aside
 from groundproc.flight.positions.posetable import COLUMNS
 from groundproc.geodesy import LocalFrame
-from groundproc.live.estimator import Place
+from groundproc.live.place import Place
 from groundproc.live.voxelcloud import VoxelCloud
 
 MORE_COLUMNS: Final = ("lidar_ns", "matched", "seen", "residual_m", "lag_s")

@@ -17,8 +17,9 @@ from flightlog.hdl32e import POSITION_BYTES
 from groundproc.flight import load
 from groundproc.flight.load import DeviceClock, PositionBatch
 from groundproc.geodesy import LocalFrame
-from groundproc.live.estimator import Estimator, Figures, Options, Place
+from groundproc.live.estimator import Estimator, Options
 from groundproc.live.inbox import Inbox, Received
+from groundproc.live.place import Figures, Place
 from groundproc.live.products import LiveTrajectory, write_cloud
 from groundproc.live.receivers import Counts
 from groundproc.live.telemetry import Telemetry

@@ -37,7 +37,9 @@ from groundproc.estimation.observations.rows import turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
 from groundproc.estimation.odometry.slices import Slice, slices
-from groundproc.estimation.odometry.track import Track, Tracker, grid_ns, tracked
+from groundproc.estimation.odometry.stated import Recorded
+from groundproc.estimation.odometry.track import Track, grid_ns
+from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.flight.timeline import Leg
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.trajectory.estimate import Estimate
@@ -134,10 +136,9 @@ def adjust_run(
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     observations = [*observations_of(Flown(given, legs, units)), *more]
     sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
-    tracker = Tracker(
-        motion, start, mat, lever, gyro_offset(motion, own, other), position_track(given, legs[0]),
-        attitudes=next((found for leg in legs if (found := attitude_track(leg)) is not None), None),
-    )  # fmt: skip
+    attitudes = next((found for leg in legs if (found := attitude_track(leg)) is not None), None)
+    stated = Recorded(position_track(given, legs[0]), attitudes)
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated)
     pace = Pace(progress)
     windows: list[Window] = []
     begin = 0

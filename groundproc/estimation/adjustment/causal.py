@@ -17,7 +17,9 @@ from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
 from groundproc.estimation.odometry.slices import slices
 from groundproc.estimation.odometry.spline import Path
-from groundproc.estimation.odometry.track import Track, Tracker, tracked
+from groundproc.estimation.odometry.stated import Recorded
+from groundproc.estimation.odometry.track import Track
+from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.flight.timeline import Leg
 from groundproc.sensors.lasers import LaserCorrections
 from groundproc.trajectory.trajectory import Trajectory
@@ -91,16 +93,8 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
     motion, own, other = base_motion(given, legs[0], given.flight.runs[number])
     positions = position_track(given, legs[0])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    tracker = Tracker(
-        motion,
-        start,
-        mat,
-        lever,
-        gyro_offset(motion, own, other),
-        positions,
-        keep=False,
-        attitudes=attitude_track(legs[0]),
-    )
+    stated = Recorded(positions, attitude_track(legs[0]))
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, keep=False)
     for piece in slices(given, motion.start_ns, progress):
         tracker.feed(piece)
     track = tracked(tracker)

@@ -5,7 +5,7 @@ the autopilot's (10 to 400 Hz through MAVLink, better, stamped by another clock)
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -123,6 +123,36 @@ def _noise(samples: Array) -> float:
     if len(samples) < 3 or not np.isfinite(samples).all():
         return float("nan")
     return robust.white_noise(samples)
+
+
+class MotionGrid(Protocol):
+    """What the odometry needs of the motion: of a whole recording, or of a flight that goes on.
+
+    Attributes
+    ----------
+    start_ns : int
+        Start of the grid; step i is from start_ns + i STEP_NS to the next.
+    rate_rad_s, force_m_s2 : ndarray, shape (n, 3)
+        Mean rate and specific force of each step, sensor frame.
+    known : ndarray of bool, shape (n,)
+        Whether samples say it.
+    rate_density, force_density : float
+        Noise as in `ImuTrack`.
+    """
+
+    @property
+    def start_ns(self) -> int: ...  # noqa: D102
+    @property
+    def rate_rad_s(self) -> Array: ...  # noqa: D102
+    @property
+    def force_m_s2(self) -> Array: ...  # noqa: D102
+    @property
+    def known(self) -> npt.NDArray[np.bool_]: ...  # noqa: D102
+    @property
+    def rate_density(self) -> float: ...  # noqa: D102
+    @property
+    def force_density(self) -> float: ...  # noqa: D102
+    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.matching import update
-from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.motion import MotionGrid
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
 from groundproc.estimation.odometry.state import POSITION, ROTATION, STATES, STEP_S, State, apply, propagate
 from groundproc.estimation.odometry.voxels import COUNT, MEAN, SCATTER, PlaneMap
@@ -67,7 +67,7 @@ class Odometry:
     ----------
     state : State
         At the start of slice `number`.
-    motion : Motion
+    motion : MotionGrid
     number : int
     voxel_m : float
         Edge of the map's voxels.
@@ -78,7 +78,7 @@ class Odometry:
     REACH_M: Final = 250.0
     """The map forgets what lies farther away than this."""
 
-    def __init__(self, state: State, motion: Motion, number: int, voxel_m: float) -> None:
+    def __init__(self, state: State, motion: MotionGrid, number: int, voxel_m: float) -> None:
         self.state, self.number, self.voxel_m = state, number, voxel_m
         self._motion = motion
         self.map = PlaneMap(voxel_m)
