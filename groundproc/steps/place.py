@@ -4,7 +4,6 @@ import functools
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, Final
 
 from flightlog.hdl32e import RANGE_LSB_M
@@ -15,7 +14,7 @@ from groundproc.geodesy import LocalFrame
 from groundproc.products.pictures import draw_cloud
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.run import Run
-from groundproc.steps.step import Request, Step
+from groundproc.steps.step import WHOLE, Folders, Request, Step
 from groundproc.survey import PlacingSettings, Survey, section
 
 FOUND: Final = f"{INSIDE}/place.json"
@@ -40,8 +39,9 @@ def projection_of(frame: LocalFrame, survey: Survey) -> geodesy.Projection:
     return geodesy.Projection(frame, geodesy.projected_crs(code))
 
 
-def work(run: Run, folder: Path) -> None:
+def work(run: Run, folders: Folders) -> None:
     """Place the points and finish the products that are made of them."""
+    folder = folders[WHOLE]
     made = run.estimate
     timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
     projection = projection_of(made.trajectory.frame, run.survey)
