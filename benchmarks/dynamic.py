@@ -112,7 +112,7 @@ def cloud(
         kept = points.time_ns // FIRING_NS % EVERY == 0
         places.append(points.xyz_m[kept])
         times.append(points.time_ns[kept])
-        lasers.append(points.laser[kept])
+        lasers.append(points["laser"][kept])
     time_ns = np.concatenate(times)
     keys = (time_ns - given.readers[0].start_ns) * LASERS + np.concatenate(lasers)
     return np.concatenate(places), time_ns, keys

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy import patches
@@ -254,7 +253,7 @@ class _Sums:
             self._unmatched += len(placed)
             return
         at, of_floor, of_echo = _matched(self._numbers(placed), self._numbers(floor), numbers)
-        same = np.abs(placed.range_steps[at] * RANGE_LSB_M - echoes["range_m"][of_echo]) < SAME_ECHO_M
+        same = np.abs(placed["range"][at] - echoes["range_m"][of_echo]) < SAME_ECHO_M
         at, of_floor, of_echo = at[same], of_floor[same], of_echo[same]
         self._unmatched += len(placed) - len(at)
         if not len(at):
@@ -278,8 +277,8 @@ class _Sums:
             self._slices.append((self._section.coordinates(found[inside]), time_ns[inside]))
 
     def _numbers(self, points: Points) -> Times:
-        rank = (points.returns & 0x0F).astype(np.int64) - 1
-        return shot_numbers(points.time_ns, points.laser, rank, self._start_ns)
+        rank = points["return_number"].astype(np.int64) - 1
+        return shot_numbers(points.time_ns, points["laser"], rank, self._start_ns)
 
     def _points(self, hits: Array, found: Array, best: Array, time_ns: int) -> None:
         square = np.stack([np.square(points - hits).sum(axis=1) for points in (found, best)], axis=1)

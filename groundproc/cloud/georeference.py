@@ -70,15 +70,14 @@ def georeference(
     counters = np.zeros(4, np.int64)
     count = place(raw, head, time_ns, table, *limits, covered, sensor, out, counters)
     stamps, xyz, ranges, intensity, laser, returns = out
-    return Points(
-        stamps[:count],
-        xyz[:count],
-        ranges[:count],
-        intensity[:count],
-        laser[:count],
-        returns[:count],
-        Dropped(*counters.tolist()),
-    )
+    columns = {
+        "intensity": intensity[:count],
+        "return_number": returns[:count] & 0x0F,
+        "number_of_returns": returns[:count] >> 4,
+        "laser": laser[:count],
+        "range": np.multiply(ranges[:count], RANGE_LSB_M, dtype=np.float32),
+    }
+    return Points(stamps[:count], xyz[:count], columns, Dropped(*counters.tolist()))
 
 
 def project(xyz_m: Array, polynomial: Polynomial) -> None:

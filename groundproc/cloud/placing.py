@@ -1,9 +1,8 @@
-"""The stage that makes the cloud: every packet given its time and pose, placed, projected and written; and what became of each."""
+"""The stage that makes the cloud: every packet given its time and pose, placed, projected and handed on; and what became of each."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -11,18 +10,18 @@ import numpy.typing as npt
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from flightlog.logfile import LogReader
+from flightlog.mount import Mount
 from groundproc import geodesy
-from groundproc.cloud import georeference, las
+from groundproc.cloud import georeference
 from groundproc.cloud.points import Dropped, Points
-from groundproc.files import written_aside
 from groundproc.flight import load
 from groundproc.flight.timeline import Leg
-from groundproc.products.pictures import CloudSample
 from groundproc.sensors import hdl32e as decode
 from groundproc.sensors import identity as sensor_model
-from groundproc.sensors.hdl32e import Gate
-from groundproc.survey import Survey
-from groundproc.trajectory.estimate import Estimate
+from groundproc.sensors.hdl32e import Gate, LaserTable
+from groundproc.trajectory.trajectory import Trajectory
+
+Times = npt.NDArray[np.int64]
 
 CHUNK_PACKETS: Final = 1808
 """Packets placed at a time, a second's worth: bounds the memory, and is long enough for both cores to compress."""
@@ -39,59 +38,82 @@ class Tally:
     queue_drops: int = 0
     rejected: int = 0
     packets_without_leg: int = 0
-    written: int = 0
-    dropped: Dropped = field(default_factory=Dropped)
 
 
-def write_cloud(
-    readers: Sequence[LogReader],
-    timeline: Sequence[Leg],
-    made: Estimate,
-    survey: Survey,
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """How many points were placed, and what became of the other shots."""
+
+    points: int
+    dropped: Dropped
+
+
+class Sink(Protocol):
+    """Takes the points of a flight as they are placed."""
+
+    def begin(self) -> None:
+        """Get ready: the first points come."""
+
+    def add(self, points: Points) -> None:
+        """Take some projected points; their arrays are not to be changed."""
+
+    def finish(self) -> None:
+        """All points were given."""
+
+
+def place(
+    packets: Iterable[tuple[npt.NDArray[np.void], Times]],
+    trajectory: Trajectory,
+    mount: Mount,
     projection: geodesy.Projection,
-    folder: Path,
-    progress: Callable[[int], None],
-) -> tuple[Tally, CloudSample]:
-    """Place every packet and write cloud.laz."""
-    tally, sample, trajectory = Tally(), CloudSample(), made.trajectory
-    gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
-    start = projection.exact(trajectory.position_m[:1])[0]
-    offset_m = [float(np.floor(start[0] / 100) * 100), float(np.floor(start[1] / 100) * 100), 0.0]
-    with (
-        written_aside(folder / "cloud.laz") as aside,
-        las.CloudWriter(aside, [las.LASER, las.RANGE], crs=cloud_crs(projection, survey), offset_m=offset_m) as cloud,
-    ):
-        for packets, utc_ns in chunks(readers, timeline, tally, progress):
-            points = georeference.georeference(packets, utc_ns, trajectory, made.mount, gate, made.lasers)
-            tally.dropped = tally.dropped + points.dropped
-            if len(points):
-                project(points, projection)
-                write_points(cloud, points)
-                sample.add(points.xyz_m, points.intensity)
-        tally.written = cloud.points
-        if not tally.written:
-            raise CoverageError(
-                f"{readers[0].path}: not one of {tally.packets} lidar packets gives a point; "
-                f"the trajectory covers {utc_text(int(trajectory.time_ns[0]))} to {utc_text(int(trajectory.time_ns[-1]))}, "
-                f"and {tally.dropped.no_pose} shots lie outside it"
-            )
-    return tally, sample
+    sinks: Sequence[Sink],
+    *,
+    gate: Gate,
+    lasers: LaserTable,
+) -> Placed:
+    """Place and project all packets, and hand the points to the sinks, a second of flight at a time.
 
+    Parameters
+    ----------
+    packets : iterable of (ndarray, ndarray of int64)
+        As of `chunks`.
+    trajectory : Trajectory
+    mount : Mount
+    projection : geodesy.Projection
+        From the trajectory's frame.
+    sinks : sequence of Sink
+    gate : Gate
+    lasers : LaserTable
 
-def cloud_crs(projection: geodesy.Projection, survey: Survey) -> Any:
-    """The CRS that the file states: with EGM 96 as the height reference where heights are above sea level."""
-    return geodesy.with_sea_level(projection.crs) if survey.height == "msl" else projection.crs
+    Raises
+    ------
+    CoverageError
+        Not one point.
+    """
+    for sink in sinks:
+        sink.begin()
+    count, dropped = 0, Dropped()
+    for some, utc_ns in packets:
+        points = georeference.georeference(some, utc_ns, trajectory, mount, gate, lasers)
+        dropped = dropped + points.dropped
+        if len(points):
+            count += len(points)
+            project(points, projection)
+            for sink in sinks:
+                sink.add(points)
+    if not count:
+        raise CoverageError(
+            f"not one lidar packet gives a point: the trajectory covers {utc_text(int(trajectory.time_ns[0]))} to "
+            f"{utc_text(int(trajectory.time_ns[-1]))}, and {dropped.no_pose} shots lie outside it"
+        )
+    for sink in sinks:
+        sink.finish()
+    return Placed(count, dropped)
 
 
 def project(points: Points, projection: geodesy.Projection) -> None:
     """Put points into the projected CRS, in place."""
     georeference.project(points.xyz_m, projection.polynomial(*georeference.extent(points.xyz_m)))
-
-
-def write_points(cloud: las.CloudWriter, points: Points) -> None:
-    """Hand projected points to the file."""
-    extras: dict[str, npt.NDArray[Any]] = {"laser": points.laser, "range": points.range_steps}
-    cloud.write(points.xyz_m, las.gps_time_s(points.time_ns), points.intensity, points.returns, extras)
 
 
 def chunks(

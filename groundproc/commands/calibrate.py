@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.flight.mounting import find_mount
     from groundproc.products.laser_plot import draw_lasers
     from groundproc.progress import stages
+    from groundproc.sensors.hdl32e import LaserTable
     from groundproc.sensors.lasers import write_lasers
 
     logs = arguments.logs
@@ -67,7 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
             write_compass(arguments.output / "compass.yaml", result.compass, _compass_head(result))
         if result.lasers is not None:
             write_lasers(arguments.output / "lasers.yaml", result.lasers.file(), _lasers_head(result))
-            draw_lasers(arguments.output / "lasers.png", result.lasers)
+            with written_aside(arguments.output / "lasers.png") as aside:
+                draw_lasers(result.lasers.figures(LaserTable.nominal())).savefig(aside, format="png")
         with written_aside(arguments.output / "calibration.json") as aside:
             aside.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(report, indent=2) if arguments.json else _text(report, arguments.output))

@@ -121,11 +121,13 @@ def _print_states(found: Sequence[State], folder: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"folder": str(folder), "steps": [asdict(state) for state in found]}, indent=2))
         return
-    for state in found:
+    rows = [(state.step.partition(": "), state) for state in found]
+    width = max(len(part or step) + 2 * bool(part) for (step, _, part), _ in rows) + 2
+    for (step, _, part), state in rows:
         when = f"{state.finished}, {state.seconds:.1f} s" if state.finished else ""
-        print(f"{state.step:<12}{state.state:<9}{'; '.join(state.reasons) or when}")
-        if state.outputs:
-            print(f"{'':<21}{', '.join(state.outputs)}")
+        print(f"{'  ' + part if part else step:<{width}}{state.state:<9}{'; '.join(state.reasons) or when}")
+        if state.outputs and state.outputs != (part,):
+            print(f"{'':<{width + 9}}{', '.join(state.outputs)}")
 
 
 def _report(quality: dict[str, Any], folder: Path) -> str:
@@ -142,9 +144,18 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         + (f"; {sync['note']}" if sync["note"] else ""),
         *_control_lines(quality.get(track["method"], {}).get("control")),
         _mount_line(quality["mount"]),
-        f"look at {folder / 'cloud_height.png'} and {folder / 'cloud_intensity.png'}; all figures are in {folder / 'quality.json'}",
+        *_where(folder),
     ]
     return "\n".join(lines)
+
+
+def _where(folder: Path) -> list[str]:
+    """What to look at first, of what was chosen."""
+    shown = [folder / name for name in ("cloud_height.png", "cloud_intensity.png") if (folder / name).exists()]
+    parts = [f"look at {' and '.join(map(str, shown))}"] if shown else []
+    if (figures := folder / "quality.json").exists():
+        parts.append(f"all figures are in {figures}")
+    return ["; ".join(parts)] if parts else []
 
 
 def _mount_line(mount: dict[str, Any]) -> str:

@@ -4,22 +4,24 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flightlog import nmea
 from flightlog.constants import HOUR_NS
 from flightlog.errors import LogError
+from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
-from groundproc.cloud import las
+from groundproc.cloud.points import Points
+from groundproc.cloud.writer import CloudWriter
 from groundproc.files import make_folder, written_aside
 from groundproc.flight import load, timebase
-from groundproc.flight.timebase import UtcTie
 from groundproc.sensors import hdl32e as decode
 from groundproc.sensors import identity as sensor_model
 from groundproc.sensors.hdl32e import Gate, Shots
+
+COLUMNS: Final = ("intensity", "return_number", "number_of_returns", "laser", "azimuth", "range")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,7 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
         origin_ns: int | None = None
         with (
             written_aside(output) as aside,
-            las.CloudWriter(aside, [las.LASER, las.AZIMUTH, las.RANGE], gps=tie is not None, about=about) as cloud,
+            CloudWriter(aside, COLUMNS, gps=tie is not None, about=about) as cloud,
         ):
             for batch in load.lidar_batches(readers, progress):
                 if not len(batch.packets):
@@ -61,7 +63,7 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
                     origin_ns = int(batch.device_time_ns[0]) // HOUR_NS * HOUR_NS
                 for packets, time_ns in decode.by_mode(batch.packets, batch.device_time_ns):
                     shots = decode.decode(packets, time_ns, gate)
-                    _write(cloud, shots, _seconds(shots.time_ns, origin_ns, tie))
+                    cloud.write(points_of(shots, origin_ns if tie is None else -tie.offset_ns))
             if origin_ns is None:
                 raise LogError(f"{readers[0].path}: no lidar packets in the log")
             if not cloud.points:
@@ -69,14 +71,16 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
     return SensorCloud(cloud.points, "GPS time" if tie else "sensor time in seconds past the hour of the first packet")
 
 
-def _seconds(time_ns: npt.NDArray[np.int64], origin_ns: int, tie: UtcTie | None) -> npt.NDArray[np.float64]:
-    """What stands in the file for lidar times [ns]: GPS time, or seconds since an origin."""
-    if tie is None:
-        return np.asarray((time_ns - origin_ns) * 1e-9, np.float64)
-    return las.gps_time_s(time_ns + tie.offset_ns)
-
-
-def _write(cloud: las.CloudWriter, shots: Shots, seconds: npt.NDArray[np.float64]) -> None:
-    azimuth = np.rint(shots.azimuth_cdeg).astype(np.uint16) % 36_000
-    extras: dict[str, npt.NDArray[Any]] = {"laser": shots.laser, "azimuth": azimuth, "range": shots.range_steps}
-    cloud.write(shots.xyz_m, seconds, shots.intensity, shots.returns, extras)
+def points_of(shots: Shots, origin_ns: int) -> Points:
+    """Shots as points of the sensor's own frame, their times counted from an origin."""
+    # the last hundredth of a turn is rounded up to a whole one, which is 0
+    azimuth_cdeg = np.rint(shots.azimuth_cdeg) % 36_000
+    columns = {
+        "intensity": shots.intensity,
+        "return_number": shots.returns & 0x0F,
+        "number_of_returns": shots.returns >> 4,
+        "laser": shots.laser,
+        "azimuth": np.multiply(azimuth_cdeg, 0.01, dtype=np.float32),
+        "range": np.multiply(shots.range_steps, RANGE_LSB_M, dtype=np.float32),
+    }
+    return Points(shots.time_ns - origin_ns, shots.xyz_m.astype(np.float64), columns)

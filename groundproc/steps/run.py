@@ -51,6 +51,11 @@ class Run:
         """What the user chose."""
         return self.request.survey
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the logs."""
+        return tuple(path.name for path in self.request.logs)
+
     @cached_property
     def readers(self) -> Sequence[LogReader]:
         """The logs, in order of time."""

@@ -62,11 +62,7 @@ def check(request: Request) -> None:
 
 def work(run: Run, folders: Folders) -> None:
     """Estimate, and write the estimate's folder."""
-    folder = folders[WHOLE]
-    made = estimate(run)
-    write_estimate(folder, made)
-    for write in made.products:
-        write(folder)
+    write_estimate(folders[WHOLE], estimate(run))
 
 
 def estimate(run: Run) -> Estimate:

@@ -136,7 +136,7 @@ class PlacingSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """Output: coordinates and heights of the products."""
+    """Output: which products, and their coordinates and heights."""
 
     crs: int | str | None = setting(
         None,
@@ -153,6 +153,15 @@ class OutputSettings:
         words=("--geoid",),
         metavar="N",
         absent="none",
+    )
+    products: tuple[Any, ...] | None = setting(
+        None,
+        "what is made beside trajectory.csv and quality.json, by name: cloud.laz,pictures",
+        words=("--products",),
+        metavar="NAMES",
+        reads="names",
+        absent="all of docs/products.md that are made by default",
+        in_file="a list; a name with options of its own is a mapping: [cloud.laz, {NAME: {OPTION: VALUE}}]",
     )
 
 

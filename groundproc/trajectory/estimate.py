@@ -15,7 +15,6 @@ docs/estimate.md describes each file.
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -112,7 +111,6 @@ class Estimate:
     report: dict[str, Any] = field(default_factory=dict)
     warning: str = ""
     figures: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
-    products: tuple[Callable[[Path], None], ...] = ()
     method: str = ""
     note: str = ""
 

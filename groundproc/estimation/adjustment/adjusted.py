@@ -3,8 +3,6 @@
 packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass; and the sigma of each.
 """
 
-import functools
-import pathlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
@@ -21,6 +19,7 @@ from groundproc.estimation.adjustment.anchors import within
 from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
 from groundproc.estimation.adjustment.control import control_report, control_warnings
 from groundproc.estimation.adjustment.factors import H
+from groundproc.estimation.adjustment.figures import Figures, odometry_figures, outcome_figures, stated_figures
 from groundproc.estimation.adjustment.joining import Joined, joining
 from groundproc.estimation.adjustment.lasers import Corrections
 from groundproc.estimation.adjustment.outside import DELAY, outside_track
@@ -105,23 +104,24 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
         mount_source=main.mount_source(given.mount_source),
         report=main.report(given.mount),
         warning="; ".join(warnings),
-        products=(
-            functools.partial(_draw, main, given, trajectory),
-            *(() if corrections is None else (functools.partial(_draw_lasers, corrections),)),
-        ),
+        figures=_figures(main, given, trajectory) | ({} if corrections is None else corrections.figures(given.lasers)),
     )
 
 
-def _draw(run: "Run | CausalRun", given: Given, trajectory: Trajectory, folder: pathlib.Path) -> None:
-    from groundproc.products.adjustment_plot import draw_adjustment, sheet_of
-
-    draw_adjustment(folder / "adjustment.png", sheet_of(run, given, trajectory))
-
-
-def _draw_lasers(corrections: Corrections, folder: pathlib.Path) -> None:
-    from groundproc.products.laser_plot import draw_lasers
-
-    draw_lasers(folder / "lasers.png", corrections)
+def _figures(run: "Run | CausalRun", given: Given, trajectory: Trajectory) -> Figures:
+    """What pictures show of a run."""
+    windows = run.windows if isinstance(run, Run) else []
+    seen = odometry_figures(run.track, run.motion, run.path if windows else None, trajectory)
+    stated = stated_figures(
+        int(seen["adjustment.begin_ns"]),
+        run.path,
+        [position_track(given, leg) for leg in given.placed],
+        [attitude for leg in given.placed if (attitude := attitude_track(leg)) is not None],
+        run.mount(given.mount).mat_ins_lidar(),
+    )
+    last_round = windows[-1].log[-1] if windows else {}
+    estimated = run.report(given.mount).get("estimated", {})
+    return seen | stated | outcome_figures(len(windows), run.track.restarts, run.is_worse(), last_round, estimated)
 
 
 @dataclass(slots=True)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog.hdl32e import LASERS
+from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import LaserCorrections
 
 Array = npt.NDArray[np.float64]
@@ -116,6 +117,23 @@ class Corrections:
             }
         sigma = np.sqrt(np.diag(self.covariance))
         return stated | {"correlation": (self.covariance / np.outer(sigma, sigma)).round(3).tolist()}
+
+    def figures(self, table: LaserTable) -> dict[str, npt.NDArray[Any]]:
+        """The same as plain arrays for pictures, with the elevations of the table that the returns were placed with.
+
+        For each kind (`range`, `m`; `elevation`, `rad`): lasers.KIND_UNIT, KIND_sigma_UNIT, KIND_found (bool), shape (32,); and
+        KIND_mean_UNIT, shape (2,): the mean offset and its sigma. lasers.table_elevation_rad, shape (32,).
+        """
+        made: dict[str, npt.NDArray[Any]] = {"lasers.table_elevation_rad": table.elevation_rad}
+        for kind, unit in (("range", "m"), ("elevation", "rad")):
+            value, sigma, found = self.of(kind)
+            made |= {
+                f"lasers.{kind}_{unit}": value,
+                f"lasers.{kind}_sigma_{unit}": sigma,
+                f"lasers.{kind}_found": found,
+                f"lasers.{kind}_mean_{unit}": np.array(self.mean(kind)),
+            }
+        return made
 
 
 def stretched(covariance: Array, by: float) -> Array:

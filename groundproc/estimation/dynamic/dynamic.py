@@ -19,7 +19,7 @@ from groundproc.estimation.calibration.compass import CompassCurve, Run, read_co
 from groundproc.estimation.dynamic import course as courses
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
-from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw, write_trims
+from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
 from groundproc.estimation.method import Given, Progress
 from groundproc.sensors.hdl32e import Gate
 from groundproc.trajectory.estimate import Estimate
@@ -87,7 +87,7 @@ def dynamic_estimate(given: Given, progress: Progress, start: Method) -> Estimat
         trajectory=applied(trajectory, values),
         sigma_source=f"those of method {options.start}, less the trims: {begun.sigma_source}",
         report=report,
-        products=(functools.partial(_write, trims),),
+        figures=trims.figures(),
     )
 
 
@@ -162,10 +162,3 @@ def _before_after(pairs: Array) -> dict[str, float] | None:
     """Mean over the revolutions that could be compared; None where none could."""
     known = pairs[np.isfinite(pairs).all(axis=1)]
     return {"before": float(known[:, 0].mean()), "after": float(known[:, 1].mean())} if len(known) else None
-
-
-def _write(trims: Trims, folder: Path) -> None:
-    from groundproc.products.trim_plot import draw_trims
-
-    write_trims(folder / "trims.csv", trims)
-    draw_trims(folder / "trims.png", trims.time_ns, _named(trims.values), np.rad2deg(trims.course_rad))

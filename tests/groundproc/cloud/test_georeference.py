@@ -102,8 +102,11 @@ def test_every_point_is_where_the_sources_equation_puts_it(
     expected = on_airframe @ by_the_source(-heading, pitch, roll) + np.array(position)
     np.testing.assert_allclose(points.xyz_m, expected, atol=1e-6)
     assert (points.time_ns == shots.time_ns).all()
-    for name in ("range_steps", "intensity", "laser", "returns"):
-        assert (getattr(points, name) == getattr(shots, name)).all()
+    for name in ("intensity", "laser"):
+        assert (points[name] == getattr(shots, name)).all()
+    assert (points["return_number"] == shots.returns & 15).all()
+    assert (points["number_of_returns"] == shots.returns >> 4).all()
+    np.testing.assert_allclose(points["range"], shots.range_steps * 0.002, rtol=2e-7)
 
 
 def sensor_xyz(shots: decode.Shots) -> Array:
@@ -219,7 +222,8 @@ def test_two_returns_of_a_pair_lie_on_one_line_from_the_lidar(data_payload: Call
     where = np.array([10.0, 20.0, 30.0])
     quat = quat_wxyz(1.0, 0.2, -0.1)
     points = georeference(packets, np.array([START_NS]), at_rest(where, quat), Mount())
-    assert points.returns.tolist() == [0x21, 0x22] * 192
+    assert points["return_number"].tolist() == [1, 2] * 192
+    assert (points["number_of_returns"] == 2).all()
     lidar = where + Rotation.from_euler("ZXY", [-1.0, 0.2, -0.1]).apply([0.0, 0.0, -0.16])
     near, far = points.xyz_m[::2] - lidar, points.xyz_m[1::2] - lidar
     np.testing.assert_allclose(far, near * 1.5, atol=1e-9)
