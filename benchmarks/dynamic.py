@@ -37,7 +37,7 @@ from groundproc.accuracy.alignment import align
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
 from groundproc.cloud.georeference import georeference
 from groundproc.cloud.placing import Tally, chunks
-from groundproc.estimation import methods
+from groundproc.estimation import direct
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import Found, Search
 from groundproc.estimation.dynamic.trims import applied, interpolated
@@ -177,7 +177,7 @@ def experiment(name: str, folder: Path, results: Path) -> dict[str, Any]:
         flight = read_flight([reader], "ins")
         timeline: list[Leg] = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), survey.sync)
         given = gather([reader], flight, timeline, mount, survey)
-        start = methods.ins_estimate(given, lambda *_: None).trajectory
+        start = direct.ins_estimate(given, lambda *_: None).trajectory
         none = np.empty(0, np.int64)
         made = {
             "ins": Made(start, none, np.empty(0), None),

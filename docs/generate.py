@@ -1,14 +1,19 @@
-"""Writes docs/log-format.md from the table of records, so that the page and the programs cannot differ.
+"""Writes the pages that are tables of the programs, so that page and programs cannot differ.
 
-Run it after a change of flightlog/records.py: python docs/generate.py
+log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
+groundproc/products. Run it after a change of these: python docs/generate.py
 """
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
 from flightlog.records import FORMAT_VERSION, TABLE, RecordType
+from groundproc import products
+from groundproc.cloud import dimensions
+from groundproc.cloud.dimensions import Dimension
 
-PAGE: Final = Path(__file__).with_name("log-format.md")
+DOCS: Final = Path(__file__).parent
 
 _RULE: Final = "=" * 80 + "\nMSG: "
 _STANDARD: Final = ("std_msgs/Header", "builtin_interfaces/Time")
@@ -94,5 +99,84 @@ def _section(row: RecordType) -> str:
     return "\n".join(parts)
 
 
+_DIMENSIONS: Final = """\
+# Attributes of points
+
+<!-- Made by docs/generate.py from groundproc/cloud/dimensions.py: change that, not this. -->
+
+Every cloud that `swath` writes or reads has its attributes from this table. LAS files are of version 1.4, point format 6; with colours 7,
+with near infrared 8. What the standard has no field for is in extra bytes of the same name, whose description in the file says the unit.
+A file holds what something filled, and no more. In the program a column has the name and the unit that stand here.
+
+A *step* is the least difference that the file can hold; the value is the stored number times the step.
+
+## Every point
+"""
+
+_READING: Final = """\
+## Clouds of other programs
+
+LAS and LAZ of every version and point format are read. Fields of the standard are taken as they are. Extra bytes are taken as an attribute
+of this table if they have its name, their description states its unit, and its column can hold them. A cloud that is written anew with
+other coordinates (`swath adjust`) keeps all its fields and extra bytes, those that stand nowhere here too.
+"""
+
+_PRODUCTS: Final = """\
+# Products
+
+<!-- Made by docs/generate.py from the registry of groundproc/products: change that, not this. -->
+
+`swath process` makes these. `products` in survey.yaml, or `--products`, chooses:
+
+```yaml
+products: [cloud.laz, pictures]
+```
+
+A product with options of its own is a mapping of its name to them: `{NAME: {OPTION: VALUE}}`. Whatever is chosen, `trajectory.csv` and
+`quality.json` are there. Each product is written aside and gets its name when it is whole; an error says which product it is of. A product
+of a method is made only where that method ran.
+
+| name | by default | what it is |
+|---|---|---|
+"""
+
+
+def dimensions_page() -> str:
+    """docs/dimensions.md."""
+    parts = [_DIMENSIONS, _attributes(dimensions.PLACED), "## Attributes\n", _attributes(dimensions.TABLE), _READING]
+    return "\n".join(parts)
+
+
+def _attributes(entries: Iterable[Dimension]) -> str:
+    rows = [
+        "| name | unit | in the file | step | least | largest | meaning | filled by |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for entry in entries:
+        low, high = (f"{value:.7g}" for value in entry.limits()) if entry.stored.kind != "f" else ("", "")
+        place = f"`{entry.field}`" if entry.field else "extra bytes"
+        step = "" if entry.scale is None else f"{entry.scale:g}"
+        about = entry.about + ("" if entry.no_data is None else f" {entry.no_data}: not known.")
+        rows.append(
+            f"| `{entry.name}` | {entry.unit} | {place}, {entry.dtype} | {step} | {low} | {high} | {about} | {entry.source} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def products_page() -> str:
+    """docs/products.md."""
+    rows = [
+        f"| `{name}` | {'yes' if entry.by_default else 'no'} | {entry.about} |"
+        for name, entry in products.REGISTRY.items()
+    ]
+    return _PRODUCTS + "\n".join(rows) + "\n"
+
+
+PAGES: Final[dict[str, Callable[[], str]]] = {
+    "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page,
+}  # fmt: skip
+
+
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    for name, made in PAGES.items():
+        (DOCS / name).write_text(made(), encoding="utf-8")

@@ -89,8 +89,8 @@ def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> Fli
     from flightlog.logfile import LogReader
     from groundproc.estimation.adjustment import adjusted
     from groundproc.estimation.calibration.mount import COMPASS, SHARED, flight_result
+    from groundproc.estimation.direct import ins_estimate
     from groundproc.estimation.method import gather
-    from groundproc.estimation.methods import ins_estimate
     from groundproc.flight.flight import read_flight
     from groundproc.flight.timeline import legs
     from groundproc.sensors.lasers import ESTIMATE

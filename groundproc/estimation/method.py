@@ -1,4 +1,4 @@
-"""What every method of making a trajectory is given. It gives an Estimate back (`trajectory.estimate`)."""
+"""What a method of making a trajectory is, and what it is given; it gives an Estimate back (`trajectory.estimate`)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +15,7 @@ from groundproc.geodesy import LocalFrame
 from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections, read_lasers
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 Progress = Callable[[str, int], None]
 """Is told that so many more bytes of the logs are through a stage: "read", "adjust" or "place"."""
@@ -61,6 +62,28 @@ class Given:
     def lasers(self) -> LaserTable:
         """The lasers to begin with: the manual's table with the corrections."""
         return self.corrections.table()
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A way of making a trajectory; each stands in its own module, under the name METHOD.
+
+    Attributes
+    ----------
+    estimate : callable
+        Makes the estimate; LogError or CoverageError where the log does not hold what the method needs.
+    options : tuple of str
+        Options of the survey that not every method looks at, and this one does.
+    finds_lasers : bool
+        Whether it finds corrections of the single lasers where it is asked to.
+    uses_points : bool
+        Whether it looks at the lidar's returns, and so at which of them are kept.
+    """
+
+    estimate: Callable[[Given, Progress], Estimate]
+    options: tuple[str, ...] = ()
+    finds_lasers: bool = False
+    uses_points: bool = False
 
 
 def gather(

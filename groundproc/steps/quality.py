@@ -69,10 +69,10 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
 
 def describe_mount(made: Estimate) -> dict[str, Any]:
     """Where the mount that was used comes from, and how well it is known where it was estimated."""
-    sigma = made.mount_sigma
-    stated = None
+    sigma, stated = made.mount_sigma, None
     if sigma is not None:
-        stated = {"turn_deg": np.rad2deg(sigma.turn_rad).tolist(), "position_m": list(sigma.position_m)}
+        arm = None if sigma.position_m is None else list(sigma.position_m)
+        stated = {"turn_deg": np.rad2deg(sigma.turn_rad).tolist(), "position_m": arm}
     return {"source": made.mount_source, "sigma": stated}
 
 

@@ -31,12 +31,12 @@ def settings(request: Request) -> Mapping[str, Any]:
     found |= {"height": survey.height, "geoid": survey.geoid}
     if survey.control is not None:
         found["crs"] = config.to_mapping(survey.crs)
-    if survey.method != "dynamic":
-        del found["dynamic"]
-    if survey.method in ("ins", "filtered"):
+    tried = [methods.find(name) for name in methods.candidates(survey)]
+    looked_at = {option for method in tried for option in method.options}
+    if not any(method.uses_points for method in tried):
         for name in config.to_mapping(PlacingSettings()):
             del found[name]
-    return found
+    return {name: value for name, value in found.items() if name in looked_at or name not in methods.users()}
 
 
 def files(request: Request) -> Mapping[str, Path]:

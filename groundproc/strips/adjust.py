@@ -8,8 +8,8 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from groundproc.estimation.adjustment.batch import DEFLATION
-from groundproc.estimation.adjustment.factors import Factor, Unknowns
+from groundproc.estimation.observations.lidar import DEFLATION
+from groundproc.estimation.observations.rows import Factor, Unknowns
 from groundproc.strips.correction import Correction
 from groundproc.strips.options import AUTO, FREE, StripOptions
 from groundproc.strips.rows import ROUGHNESS_M, Bordered, bordered

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog import frames
-from groundproc.estimation.adjustment.planes import CUT, HUBER, TILT_PRIOR, Rows
+from groundproc.estimation.observations.planes import CUT, HUBER, TILT_PRIOR, Rows
 from groundproc.numerics.rotations import flattest
 from groundproc.numerics.voxelhash import voxel_key
 from groundproc.strips.correction import Correction

@@ -11,9 +11,9 @@ from typing import Any, Final
 from flightlog import config
 from flightlog.mount import Mount
 from groundproc.survey.dynamic import DynamicOptions
+from groundproc.survey.methods import METHODS
 from groundproc.survey.setting import sample_lines, setting
 
-METHODS: Final = ("best", "adjusted", "filtered", "dynamic", "ins")
 HEIGHTS: Final = ("msl", "ellipsoid", "relative")
 BESIDE: Final = "a file looked for beside this one"
 
@@ -53,7 +53,7 @@ class TrajectorySettings:
         "best",
         "how the trajectory is made; best: adjusted, or filtered or ins where the log does not hold what that needs",
         words=("--method",),
-        choices=METHODS,
+        choices=("best", *METHODS),
     )
     causal: bool = setting(False, "method adjusted: use nothing of the future, as in flight", words=("--causal",))
     positions: str | None = setting(

@@ -52,6 +52,12 @@ class Correlation:
         return Correlation(time_ns, self.at(time_ns))
 
 
+def scaled(matrix: Array, sigma_position_m: Array, sigma_attitude_rad: Array) -> Array:
+    """Covariances of correlations, shape (n, 6, 6), and sigmas, shape (n, 3) each."""
+    sigma = np.concatenate([sigma_position_m, sigma_attitude_rad], axis=1)
+    return np.asarray(matrix * (sigma[:, :, None] * sigma[:, None, :]))
+
+
 def uncorrelated(time_ns: Times) -> Correlation:
     """Nothing known but the sigmas, at times, shape (m,)."""
     return Correlation(time_ns, np.tile(np.eye(SIZE), (len(time_ns), 1, 1)))

@@ -61,12 +61,12 @@ class MountSigma:
     ----------
     turn_rad : tuple of float
         About the sensor's axes: right, forward, up.
-    position_m : tuple of float
-        Of the lever arm in the ins frame: right, forward, up.
+    position_m : tuple of float, optional
+        Of the lever arm in the ins frame: right, forward, up; None where that is not estimated.
     """
 
     turn_rad: tuple[float, float, float]
-    position_m: tuple[float, float, float]
+    position_m: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from numba import njit
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.geodesy import LocalFrame
-from groundproc.trajectory.covariance import Correlation, chained, uncorrelated
+from groundproc.trajectory.covariance import Correlation, chained, scaled, uncorrelated
 
 Array = npt.NDArray[np.float64]
 
@@ -159,10 +159,12 @@ class Trajectory:
                 f"{utc_text(int(self.time_ns[-1]))}"
             )
         seconds, knots_s = (times - self.time_ns[0]) * 1e-9, (self.time_ns - self.time_ns[0]) * 1e-9
-        columns = (*self.sigma_position_m.T, *self.sigma_attitude_rad.T)
-        sigma = np.stack([np.interp(seconds, knots_s, column) for column in columns], axis=1)
+        position, attitude = (
+            np.stack([np.interp(seconds, knots_s, column) for column in sigma.T], axis=1)
+            for sigma in (self.sigma_position_m, self.sigma_attitude_rad)
+        )
         matrix = uncorrelated(times).matrix if self.correlation is None else self.correlation.at(times)
-        return np.asarray(matrix * (sigma[:, :, None] * sigma[:, None, :]))
+        return scaled(matrix, position, attitude)
 
 
 _ARRAYS: Final = (

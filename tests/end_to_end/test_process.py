@@ -22,7 +22,7 @@ from groundproc.cli import main
 from groundproc.trajectory.estimate import FILES
 
 Array = npt.NDArray[np.float64]
-PRODUCTS = {"cloud.laz", "trajectory.csv", "quality.json", "cloud_height.png", "cloud_intensity.png"}
+PRODUCTS = {"cloud.laz", "quality.json", "cloud_height.png", "cloud_intensity.png", *FILES}
 LEDGER = ".swath"
 RANGE_NOISE_M = 0.015
 """What the simulation puts into every range (1 sigma)."""

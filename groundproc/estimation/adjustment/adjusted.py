@@ -4,25 +4,17 @@ packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
-from groundproc.estimation import ins
-from groundproc.estimation.adjustment.anchors import within
-from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, DRIFT_S, PRIORS, turned
-from groundproc.estimation.adjustment.control import control_report, control_warnings
-from groundproc.estimation.adjustment.factors import H
 from groundproc.estimation.adjustment.figures import Figures, odometry_figures, outcome_figures, stated_figures
 from groundproc.estimation.adjustment.joining import Joined, joining
-from groundproc.estimation.adjustment.lasers import Corrections
-from groundproc.estimation.adjustment.outside import DELAY, outside_track
 from groundproc.estimation.adjustment.windows import (
     OVERLAP,
     UNSEEN,
@@ -31,54 +23,46 @@ from groundproc.estimation.adjustment.windows import (
     Window,
     adjust_window,
     all_patches,
-    control_clusters,
     corrections_over,
     joined_path,
+    observations_joined,
     whole_stiffness,
 )
-from groundproc.estimation.method import Given, Progress
+from groundproc.estimation.direct import ins_estimate
+from groundproc.estimation.method import Given, Method, Progress
+from groundproc.estimation.observations import observations_of
+from groundproc.estimation.observations.attitudes import ATTITUDE_SIGMA_RAD, attitude_track
+from groundproc.estimation.observations.fixes import SLID, SLID_SIGMAS, position_track
+from groundproc.estimation.observations.lasers import Corrections
+from groundproc.estimation.observations.lidar import plane_warnings
+from groundproc.estimation.observations.observation import Flown, Outcome
+from groundproc.estimation.observations.rows import H, turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack, Motion, base_motion, on_grid
 from groundproc.estimation.odometry.slices import Slice, slices
 from groundproc.estimation.odometry.spline import Path
-from groundproc.estimation.odometry.stated import Attitudes, Positions
 from groundproc.estimation.odometry.track import Track, Tracker, grid_ns, tracked
-from groundproc.estimation.surveyed import surveyed, surveyed_control
-from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections
-from groundproc.trajectory.estimate import Estimate
+from groundproc.trajectory.covariance import Correlation, correlation_of, scaled
+from groundproc.trajectory.estimate import Estimate, MountSigma
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
 
-POSITION_TAU_S: Final = np.array([60.0, 60.0, 300.0])
-POSITION_WHITE_M: Final = 0.1
-"""Errors of a GNSS receiver that smooths last for a minute, those of a height that the barometer carries for longer (east, north, up);
-a tenth of a metre is new each second."""
-LEAST_POSITION_SIGMA_M: Final = 0.02
-ATTITUDE_SIGMA_RAD: Final = np.deg2rad([1.0, 1.0, 2.0])
-ATTITUDE_TAU_S: Final = 10.0
-"""Of an AHRS of the APM class: tilt, and heading beyond the compass's curve; its errors last for the time of its own filter."""
 
-
-def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
-    """Adjust every run of the lidar's clock.
-
-    Parameters
-    ----------
-    given : Given
-    progress : Progress
-    start : Trajectory
-        Rough poses of the ins frame over the flight.
+def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
+    """Adjust every run of the lidar's clock, begun from the autopilot's solution.
 
     Raises
     ------
     LogError
         No run has lidar, inertial data and positions together.
     """
+    begun = ins_estimate(given, progress)
+    start = begun.trajectory
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
     adjust = causal_run if given.survey.causal else adjust_run
@@ -99,9 +83,10 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
     return Estimate(
         trajectory,
         mount,
-        main.SIGMA_SOURCE,
+        begun.sigma_source if main.is_worse() else main.SIGMA_SOURCE,
         main.lasers(given.corrections),
         mount_source=main.mount_source(given.mount_source),
+        mount_sigma=main.mount_sigma(given.mount),
         report=main.report(given.mount),
         warning="; ".join(warnings),
         figures=_figures(main, given, trajectory) | ({} if corrections is None else corrections.figures(given.lasers)),
@@ -152,14 +137,14 @@ class Run:
     joined: Joined | None = None
 
     def estimates(self) -> dict[str, tuple[Array, Array]]:
-        """Globals over all windows: mean by their variances, and its sigma; the compass curve is that of the windows' joining."""
+        """Globals over all windows: mean by their variances, and its sigma; what the joining found is that."""
         found = {}
         for name in self.windows[0].values:
             values = np.array([window.values[name][0] for window in self.windows])
             weights = np.array([window.values[name][1] for window in self.windows]) ** -2.0
             sigma = np.hypot(weights.sum(axis=0) ** -0.5, UNSEEN.get(name, 0.0))
             found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), sigma)
-        return found if self.joined is None else found | {"compass": self.joined.compass}
+        return found if self.joined is None else found | self.joined.values
 
     def mount(self, nominal: Mount) -> Mount:
         """The mount as estimated; the nominal one where the trajectory is what the run began from, which was made with it."""
@@ -171,9 +156,8 @@ class Run:
         lever = nominal.lidar_position_m()
         if "ins.lever" in values:
             lever = -mat @ values["ins.lever"][0]
-        x, y, z = (float(v) for v in lever)
         return nominal.with_lidar(
-            yaw_deg=(180.0 - heading) % 360.0 - 180.0, pitch_deg=pitch, roll_deg=roll, position_m=(x, y, z)
+            yaw_deg=(180.0 - heading) % 360.0 - 180.0, pitch_deg=pitch, roll_deg=roll, position_m=_three(lever)
         )
 
     def corrections(self) -> Corrections | None:
@@ -184,6 +168,17 @@ class Run:
     def mount_source(self, nominal: str) -> str:
         """Where the mount comes from; `nominal` is where that came from which it began with."""
         return f"estimated by adjusted, begun from {nominal}" if self.estimates_mount() else nominal
+
+    def mount_sigma(self, nominal: Mount) -> MountSigma | None:
+        """How well the mount is known: the turn about the sensor's axes, the lever arm in the ins frame."""
+        if not self.estimates_mount():
+            return None
+        values = self.estimates()
+        turn, lever = values["ins.turn"][1], None
+        if "ins.lever" in values:
+            square = np.square(self.mount(nominal).mat_ins_lidar()) @ np.square(values["ins.lever"][1])
+            lever = _three(np.sqrt(square))
+        return MountSigma(_three(turn), lever)
 
     def estimates_mount(self) -> bool:
         """Whether the mount is estimated: it is not without the autopilot's gyro, nor where what the run began from is used."""
@@ -196,24 +191,25 @@ class Run:
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""
-        position = np.concatenate([w.sigma_position_m[: w.own + (w is self.windows[-1])] for w in self.windows])
-        attitude = np.concatenate([w.sigma_attitude_rad[: w.own + (w is self.windows[-1])] for w in self.windows])
+        position, attitude, correlation = (
+            np.concatenate([getattr(w, name)[: w.own + (w is self.windows[-1])] for w in self.windows])
+            for name in ("sigma_position_m", "sigma_attitude_rad", "correlation")
+        )
         if self.joined is not None:
-            position = np.hypot(position, self.joined.sigma_position_m[: len(position)])
-            attitude = np.hypot(attitude, self.joined.sigma_attitude_rad[: len(attitude)])
+            count = len(position)
+            whole = self.joined.sigma_position_m[:count], self.joined.sigma_attitude_rad[:count]
+            covariance = scaled(correlation, position, attitude) + scaled(self.joined.correlation[:count], *whole)
+            position, attitude = np.hypot(position, whole[0]), np.hypot(attitude, whole[1])
+            correlation = correlation_of(np.arange(count), covariance).matrix
         grid, knots = np.arange(len(self.path.quat)), np.arange(len(position)) * STEPS
         sigmas = (np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (position, attitude))
-        return of_ins(self.path, self.motion, given.frame, mount, *sigmas)
+        made = of_ins(self.path, self.motion, given.frame, mount, *sigmas)
+        return replace(made, correlation=Correlation(made.time_ns[knots], correlation))
 
     def warnings(self) -> list[str]:
         """What the self-check found, a sentence each."""
         found = lost(self.track)
-        chi_square = max(window.log[-1]["chi_square"] for window in self.windows)
-        if chi_square > 2.0:
-            found.append(
-                f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1 or less; the cloud may be "
-                "doubled"
-            )
+        found += plane_warnings(self.outcome())
         moved = max(
             log[-1]["moved_m"] for log in [w.log for w in self.windows] + ([self.joined.log] if self.joined else [])
         )
@@ -221,32 +217,15 @@ class Run:
             found.append(
                 f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
             )
-        slid = self.slid_sigmas()
-        if slid > SLID_SIGMAS:
-            found.append(
-                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under {SLID_SIGMAS:.0f}; "
-                + (
-                    "the trajectory is what the adjustment began from"
-                    if self.is_misled()
-                    else "the lidar may have been misled there"
-                )
-            )
-        off = max(window.log[-1].get("position_rms", 0.0) for window in self.windows)
-        if off > 4.0:
-            found.append(
-                f"the path differs from the GNSS positions by {off:.1f} sigma, expected 1; one of them is wrong"
-            )
-        off = max(window.log[-1].get("outside position_rms", 0.0) for window in self.windows)
-        if off > 1.0:
-            found.append(
-                f"the path differs from {self.sources.outside[0].source} by {off:.1f} times what its sigmas explain though its errors "
-                "last, expected under 1; sigmas, lever arm, heights or time scale of that file may be wrong"
-            )
-        return found + control_warnings(self.sources.control, self.control())
+        outcome = self.outcome()
+        # several legs have one and the same thing to say
+        said = dict.fromkeys(sentence for each in self.sources.observations for sentence in each.warnings(outcome))
+        return [*found, *said]
 
-    def control(self) -> list[list[dict[str, Any]]]:
-        """What is to be said of each control point: by the joining, or by the one window."""
-        return [window.control for window in self.windows] if self.joined is None else [self.joined.control]
+    def outcome(self) -> Outcome:
+        """What came of it, for the observations to report on."""
+        told = [window.told for window in self.windows] if self.joined is None else [self.joined.told]
+        return Outcome(self.path, [window.log[-1] for window in self.windows], told, self.is_misled())
 
     def blind_s(self) -> float:
         """Seconds in which the lidar saw next to no planes, the first one left out: there is no map yet."""
@@ -254,15 +233,15 @@ class Run:
 
     def is_blind(self) -> bool:
         """Whether the lidar saw nothing for most of the flight: without better positions it then knows no more than what it began from."""
-        return self.blind_s() > 0.5 * len(self.track) * H and not self.sources.outside
+        return self.blind_s() > 0.5 * len(self.track) * H and not self.sources.leads()
 
     def slid_sigmas(self) -> float:
         """How far the path slid away from the fixes within `DRIFT_S`, in sigmas of such a mean."""
-        return max(window.log[-1]["position_drift"] for window in self.windows)
+        return max(window.log[-1].get(SLID, 0.0) for window in self.windows)
 
     def is_misled(self) -> bool:
         """Whether the odometry lost its way and the batch did not find it again: the path goes where the fixes do not."""
-        return self.track.restarts > 0 and self.slid_sigmas() > SLID_SIGMAS and not self.sources.outside
+        return self.track.restarts > 0 and self.slid_sigmas() > SLID_SIGMAS and not self.sources.leads()
 
     def is_worse(self) -> bool:
         """Whether what the adjustment began from is better than what it made of it."""
@@ -282,22 +261,15 @@ class Run:
             "and its sigma says so"
         )
 
-    def priors(self) -> dict[str, Array]:
-        """What was known of the globals before, one sigma."""
-        known = {name: np.array(sigma) for name, sigma in PRIORS.items()} | {"compass": COMPASS_PRIOR}
-        outside = self.sources.outside
-        return known | ({DELAY: np.array(outside[0].delay_sigma_s)} if outside else {})
-
     def report(self, nominal: Mount) -> dict[str, Any]:
         """What stands in quality.json."""
         values: dict[str, Any] = {}
-        priors = self.priors()
-        corrections = self.corrections()
-        for key, (value, sigma) in self.estimates().items():
-            name = key.rsplit(".", 1)[-1]
-            scale = np.rad2deg(1.0) if name in ("bias", "turn", "accel_turn", "compass") else 1.0
-            prior = np.broadcast_to(priors[key], value.shape)
-            values[key + _UNITS[name]] = {
+        corrections, known = self.corrections(), self.windows[0].unknowns
+        for name, (value, sigma) in self.estimates().items():
+            unit = known.unit[name]
+            scale = float(np.rad2deg(1.0)) if unit.startswith("deg") else 1.0
+            prior = known.sigma[name]
+            values[f"{name}_{unit}" if unit else name] = {
                 "value": (value * scale).tolist(),
                 "sigma": (sigma * scale).tolist(),
                 "prior_sigma": (prior * scale).tolist(),
@@ -314,15 +286,7 @@ class Run:
             ],
             "joining": None if self.joined is None else self.joined.report(),
             "estimated": values,
-            "control": control_report(self.sources.control, self.control()),
-            "outside": [
-                {
-                    "source": outside.source,
-                    "positions": int(within(outside.time_ns, self.path).sum()),
-                    "residual_rms": max(w.log[-1].get("outside position_rms", 0.0) for w in self.windows),
-                }
-                for outside in self.sources.outside
-            ],
+            **self._observed(),
             **({} if corrections is None else {"lasers": corrections.report()}),
             "mount_change": {
                 "yaw_pitch_roll_deg": [
@@ -334,9 +298,16 @@ class Run:
             },
         }
 
+    def _observed(self) -> dict[str, Any]:
+        """What the observations report: lists of several under one name are put together."""
+        outcome = self.outcome()
+        told: dict[str, Any] = {"control": None, "outside": []}
+        for each in self.sources.observations:
+            for name, said in each.report(outcome).items():
+                told[name] = told.get(name, []) + said if isinstance(said, list) else said
+        return told
 
-SLID_SIGMAS: Final = 6.0
-"""A path that slides away from the fixes by more is worth a warning."""
+
 UNSETTLED_M: Final = 0.03
 """A last step larger than this is worth a warning."""
 
@@ -363,13 +334,6 @@ def of_ins(
         sigma_attitude_rad,
         np.append(motion.known[first : first + len(quat) - 1], False),
     )
-
-
-_UNITS: Final = {
-    "bias": "_deg_s", "scale": "", "shear": "", "turn": "_deg", "delay": "_s", "drift": "", "accel_bias": "_m_s2",
-    "accel_turn": "_deg", "lever": "_m",
-    "compass": "_deg",
-}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -410,6 +374,9 @@ class CausalRun:
         """The nominal mount's."""
         return nominal
 
+    def mount_sigma(self, nominal: Mount) -> None:
+        """Nothing is said of it."""
+
     def is_worse(self) -> bool:
         """It is what it is."""
         return False
@@ -428,6 +395,11 @@ class CausalRun:
             "median_matched": float(np.median(self.track.matched)),
             "median_residual_m": float(np.nanmedian(self.track.residual_m)),
         }
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 def own_part(start: Trajectory, run: Run | CausalRun) -> Trajectory:
@@ -479,21 +451,13 @@ def adjust_run(
     `exact` names globals whose covariance is wanted exactly.
     """
     motion, own, other = base_motion(given, max(legs, key=lambda leg: leg.sync.samples), given.flight.runs[number])
+    units = {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None}
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    sources = Sources(
-        {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None},
-        [position_track(given, leg) for leg in legs],
-        [attitude for leg in legs if (attitude := attitude_track(leg)) is not None],
-        mat,
-        lever,
-        exact,
-        [outside_track(fixes, mat, lever, legs[0].utc) for fixes in surveyed(given)],
-        given.survey.lasers == ESTIMATE,
-        surveyed_control(given),
-    )
+    observations = observations_of(Flown(given, legs, units))
+    sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
     tracker = Tracker(
-        motion, start, mat, lever, gyro_offset(motion, own, other), sources.positions[0],
-        attitudes=sources.attitudes[0] if sources.attitudes else None,
+        motion, start, mat, lever, gyro_offset(motion, own, other), position_track(given, legs[0]),
+        attitudes=next((found for leg in legs if (found := attitude_track(leg)) is not None), None),
     )  # fmt: skip
     pace = Pace(progress)
     windows: list[Window] = []
@@ -538,11 +502,10 @@ def joined_run(windows: list[Window], track: Track, motion: Motion, sources: Sou
         return run
     values = run.estimates()
     boresight = turned(values["ins.turn"][0]) if "ins.turn" in values else np.eye(3)
-    run.joined = joining(
-        run.path, all_patches(windows), whole_stiffness(windows), sources.positions, sources.attitudes,
-        boresight @ sources.mat_ins_lidar.T, values["compass"][0], sources.outside,
-        float(values[DELAY][0][0]) if DELAY in values else 0.0, sources.control, control_clusters(windows),
-    ).run()  # fmt: skip
+    found = {name: value for name, (value, _) in values.items()}
+    observations = observations_joined(windows, sources.observations, found)
+    mat_sensor_ins = boresight @ sources.mat_ins_lidar.T
+    run.joined = joining(run.path, all_patches(windows), whole_stiffness(windows), observations, mat_sensor_ins).run()
     run.path = run.joined.applied(run.path)
     for window in windows:
         window.seen = None
@@ -596,43 +559,6 @@ def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) ->
     return np.asarray((own_rate - rate)[both].mean(axis=0)) if both.any() else np.zeros(3)
 
 
-def position_track(given: Given, leg: Leg) -> Positions:
-    """The autopilot's positions in the local frame."""
-    fixes = given.fixes[list(given.placed).index(leg)]
-    place = given.frame.from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)
-    mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
-    good = measured(leg.boot, fixes.time_ns)
-    return Positions(
-        leg.utc_from_boot(fixes.time_ns[good]),
-        place[good],
-        np.maximum(fixes.sigma_m[good], LEAST_POSITION_SIGMA_M),
-        mat.T @ (antenna - lever),
-        POSITION_TAU_S,
-        POSITION_WHITE_M,
-    )
-
-
-RECOVERY_NS: Final = 30 * NS_PER_S
-"""So long after a fix is back, the autopilot's position still comes back from where it had drifted to."""
-
-
-def measured(boot: Boot, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Which positions rest on satellites: without a fix an autopilot goes on with a position that drifts away, and says so elsewhere."""
-    if not boot.has("GPS_RAW_INT", 2):
-        return np.ones(len(time_ns), np.bool_)
-    gps_ns, fixed = boot.stamps_ns["GPS_RAW_INT"], boot.tables["GPS_RAW_INT"]["fix_type"] >= 3
-    row = np.clip(np.searchsorted(gps_ns, time_ns, side="right") - 1, 0, len(gps_ns) - 1)
-    # a message late: between the last with a fix and the first without, it may be lost already
-    good = fixed[row] & fixed[np.minimum(row + 1, len(fixed) - 1)]
-    for regained_ns in gps_ns[1:][fixed[1:] & ~fixed[:-1]].tolist():
-        good &= (time_ns < regained_ns) | (time_ns > regained_ns + RECOVERY_NS)
-    return np.asarray(good if good.sum() >= 2 else np.ones(len(time_ns), np.bool_))
-
-
-def attitude_track(leg: Leg) -> Attitudes | None:
-    """The autopilot's attitudes."""
-    if ins.attitude_source(leg.boot) is None:
-        return None
-    _, time_ns, quat, _ = ins.attitudes(leg.boot)
-    return Attitudes(leg.utc_from_boot(time_ns), quat, ATTITUDE_SIGMA_RAD, ATTITUDE_TAU_S)
+METHOD: Final = Method(
+    adjusted_estimate, options=("positions", "control", "causal"), finds_lasers=True, uses_points=True
+)

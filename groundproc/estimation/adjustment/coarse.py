@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from flightlog import frames
-from groundproc.estimation.adjustment.planes import Rows
+from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.estimation.adjustment.planes import assign, placed, sorted_by
+from groundproc.estimation.observations.planes import assign, placed, sorted_by
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.spline import Path

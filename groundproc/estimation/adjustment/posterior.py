@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.estimation.adjustment.factors import Unknowns
 from groundproc.estimation.adjustment.noise import Noise
 from groundproc.estimation.adjustment.solve import Problem
+from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
 
@@ -56,6 +56,18 @@ class Spread:
             left += np.square(of(whole)) - np.square(of(anchored))
         return np.asarray(known + np.maximum(left / len(self.whole), 0.0))
 
+    def moments(self, of: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Covariance of linear functions of the unknowns, shape (n, k), as two parts of shape (n, k, k).
+
+        The first is known, the second is drawn: a difference, which by itself need be no covariance. The diagonal of their sum is
+        `variance` where that of the second is positive.
+        """
+        known = sum((_outer(of(column)) for column in self.columns), np.zeros_like(_outer(of(self.whole[0]))))
+        left = np.zeros_like(known)
+        for whole, anchored in zip(self.whole, self.anchored, strict=True):
+            left += _outer(of(whole)) - _outer(of(anchored))
+        return np.asarray(known), left / len(self.whole)
+
     def without(self, unknowns: Sequence[slice]) -> "Spread":
         """The same as if some unknowns were known."""
         made = Spread(self.whole.copy(), self.anchored.copy(), self.columns.copy())
@@ -63,6 +75,11 @@ class Spread:
             for where in unknowns:
                 part[:, where] = 0.0
         return made
+
+
+def _outer(values: Array) -> Array:
+    """Outer products of rows, shape (n, k), with themselves, shape (n, k, k)."""
+    return np.asarray(values[:, :, None] * values[:, None, :])
 
 
 @dataclass(slots=True)

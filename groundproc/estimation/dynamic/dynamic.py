@@ -5,7 +5,6 @@ trajectory, with which the cloud is then made.
 """
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,19 +14,19 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.errors import CoverageError
+from groundproc.estimation import methods
 from groundproc.estimation.calibration.compass import CompassCurve, Run, read_compass
 from groundproc.estimation.dynamic import course as courses
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
 from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
-from groundproc.estimation.method import Given, Progress
+from groundproc.estimation.method import Given, Method, Progress
 from groundproc.sensors.hdl32e import Gate
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
-Method = Callable[[Given, Progress], Estimate]
 
 SETTLED_S: Final = 5.0
 """Yaw trims of the first seconds are not of the compass yet: the source's settle in 2 to 5 s [s]."""
@@ -39,15 +38,8 @@ WORSE: Final = 1.02
 """Trims that make the revolutions fit each other worse than this ratio are not applied; where there is nothing to see it is 1 and noise."""
 
 
-def dynamic_estimate(given: Given, progress: Progress, start: Method) -> Estimate:
-    """The trajectory of another method, trimmed.
-
-    Parameters
-    ----------
-    given : Given
-    progress : Progress
-    start : callable
-        The method whose trajectory is trimmed.
+def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
+    """The trajectory of another method, which the survey names, trimmed.
 
     Raises
     ------
@@ -55,7 +47,7 @@ def dynamic_estimate(given: Given, progress: Progress, start: Method) -> Estimat
         Not one revolution of the lidar has a pose.
     """
     options = given.survey.dynamic
-    begun = start(given, progress)
+    begun = methods.find(options.start).estimate(given, progress)
     curve = None if given.survey.compass is None else read_compass(Path(given.survey.compass))
     trajectory = begun.trajectory if curve is None else with_compass(begun.trajectory, curve)
     course = courses.course_of(given.fixes, [leg.utc_from_boot for leg in given.placed], given.frame)
@@ -162,3 +154,6 @@ def _before_after(pairs: Array) -> dict[str, float] | None:
     """Mean over the revolutions that could be compared; None where none could."""
     known = pairs[np.isfinite(pairs).all(axis=1)]
     return {"before": float(known[:, 0].mean()), "after": float(known[:, 1].mean())} if len(known) else None
+
+
+METHOD: Final = Method(dynamic_estimate, options=("compass", "dynamic"), uses_points=True)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from flightlog.errors import SwathError
 from groundproc.cloud.gpstime import Clock
-from groundproc.estimation.adjustment.factors import Unknowns
-from groundproc.estimation.adjustment.planes import TILT_PRIOR
+from groundproc.estimation.observations.planes import TILT_PRIOR
+from groundproc.estimation.observations.rows import Unknowns
 from groundproc.geodesy import projected_crs
 from groundproc.strips.adjust import Linear, Sigmas, constant_prior, wandering
 from groundproc.strips.clouds import chunks, look

@@ -5,15 +5,17 @@ from typing import Any
 
 import pytest
 
-from groundproc.estimation.adjustment.adjusted import SLID_SIGMAS, Run
+from groundproc.estimation.adjustment.adjusted import Run
+from groundproc.estimation.observations.fixes import SLID_SIGMAS, Fixes
 
 
 def run_with(restarts: int, slid: float, outside: tuple[str, ...]) -> Run:
     track: Any = SimpleNamespace(restarts=restarts, matched=[500] * 100)
     log = [{"chi_square": 0.2, "moved_m": 0.001, "position_drift": slid, "position_rms": 0.3}]
-    windows: Any = [SimpleNamespace(log=log, control=[])]
+    windows: Any = [SimpleNamespace(log=log, told={})]
     unused: Any = None
-    sources: Any = SimpleNamespace(outside=outside, control=())
+    fixes = Fixes("fixes0", unused, 0, unused)
+    sources: Any = SimpleNamespace(observations=[fixes], leads=lambda: bool(outside))
     return Run(windows, unused, track, unused, sources)
 
 

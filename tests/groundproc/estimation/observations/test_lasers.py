@@ -10,8 +10,8 @@ import pytest
 from flightlog import frames
 from flightlog.errors import ConfigError
 from flightlog.hdl32e import ELEVATION_DEG, LASERS
-from groundproc.estimation.adjustment.lasers import PRIOR, UNKNOWNS, Corrections, shifted
-from groundproc.estimation.adjustment.planes import Rows, rows_of
+from groundproc.estimation.observations.lasers import PRIOR, UNKNOWNS, Corrections, shifted
+from groundproc.estimation.observations.planes import Rows, rows_of
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.slices import Clusterer, Slice

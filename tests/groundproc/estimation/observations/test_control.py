@@ -10,13 +10,13 @@ import pytest
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.estimation.adjustment.batch import turned
-from groundproc.estimation.adjustment.control import GATE_M, Held, control_report, control_warnings, held_to, spots_of
-from groundproc.estimation.adjustment.datum import Datum, Placing, find_datum
-from groundproc.estimation.adjustment.factors import Unknowns
 from groundproc.estimation.adjustment.posterior import Posterior, whole_covariance
 from groundproc.estimation.adjustment.solve import Wide
-from groundproc.estimation.adjustment.surfaces import Surface, near, surfaces
+from groundproc.estimation.observations.control import control_report, control_warnings
+from groundproc.estimation.observations.datum import Datum, Placing, find_datum
+from groundproc.estimation.observations.held import GATE_M, Held, held_to, spots_of
+from groundproc.estimation.observations.rows import Unknowns, turned
+from groundproc.estimation.observations.surfaces import Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path

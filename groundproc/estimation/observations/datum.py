@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from flightlog import frames
-from groundproc.estimation.adjustment.surfaces import ALIKE, Near, Surface, surfaces
+from groundproc.estimation.observations.surfaces import ALIKE, Near, Surface, surfaces
 from groundproc.estimation.odometry.odometry import GROUND
 
 Array = npt.NDArray[np.float64]

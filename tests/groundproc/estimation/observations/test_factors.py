@@ -10,23 +10,25 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from flightlog import frames
-from groundproc.estimation.adjustment import anchors
-from groundproc.estimation.adjustment.anchors import Tie
-from groundproc.estimation.adjustment.batch import make_unit, place_on_grid, turned
-from groundproc.estimation.adjustment.factors import (
+from groundproc.estimation.observations import attitudes as stated_attitudes
+from groundproc.estimation.observations import fixes
+from groundproc.estimation.observations.accelerometer import force_factor
+from groundproc.estimation.observations.gyro import turn_factor
+from groundproc.estimation.observations.rows import (
     GRAVITY,
     Factor,
     H,
     RowBuilder,
-    Unit,
     Unknowns,
     eye,
-    force_factor,
     normal_equations,
     prior_factor,
-    turn_factor,
+    turned,
     whitened,
 )
+from groundproc.estimation.observations.source import Clock
+from groundproc.estimation.observations.tie import Tie, tie_factor
+from groundproc.estimation.observations.unit import Unit, make_unit, place_on_grid
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import ImuTrack
 from groundproc.estimation.odometry.spline import Path
@@ -82,7 +84,7 @@ def unknowns_of(*names: str) -> Unknowns:
     unknowns.add("world.turn", np.ones(3))
     unknowns.add("world.shift", np.ones(3))
     for name in names:
-        unknowns.add(name, np.ones({"ins.delay": 1, "ins.drift": 1, "compass": 5}.get(name, 3)))
+        unknowns.add(name, np.ones({"ins.delay": 1, "ins.drift": 1, "late": 1, "compass": 5}.get(name, 3)))
     return unknowns
 
 
@@ -272,7 +274,7 @@ def attitudes(noise_rad: float = 0.01) -> Attitudes:
 
 
 def position_factor(path: Path, unknowns: Unknowns) -> Factor:
-    (course,) = anchors.position_factors(positions(), path, unknowns)
+    (course,) = fixes.position_factors(positions(), path, unknowns)
     return course
 
 
@@ -280,12 +282,10 @@ def test_true_positions_leave_nothing_and_their_errors_stand_in_the_residual(pat
     given = positions()
     true = replace(given, position_m=position_at((given.time_ns - START_NS) * 1e-9) + frames.mat_from_quat(
         attitude_at((given.time_ns - START_NS) * 1e-9)) @ LEVER)  # fmt: skip
-    (factor,) = anchors.position_factors(true, path, unknowns_of())
+    (factor,) = fixes.position_factors(true, path, unknowns_of())
     # straight between grid points 5 ms apart
     assert np.abs(factor.residual).max() < 1e-4
-    (moved,) = anchors.position_factors(
-        replace(true, position_m=true.position_m - [3.0, 0.0, 0.0]), path, unknowns_of()
-    )
+    (moved,) = fixes.position_factors(replace(true, position_m=true.position_m - [3.0, 0.0, 0.0]), path, unknowns_of())
     assert moved.residual[0] == pytest.approx(3.0, abs=1e-4)
 
 
@@ -308,7 +308,7 @@ def test_what_attitudes_say_is_linear_as_stated(path: Path) -> None:
     unknowns, given = unknowns_of("compass", "ins.turn"), attitudes()
 
     def made(p: Path, mat: Array = MAT_SENSOR_INS, compass: Array = COMPASS) -> Factor:
-        factor = anchors.attitude_factor(given, p, unknowns, mat, compass, "ins.turn")
+        factor = stated_attitudes.attitude_factor(given, p, unknowns, mat, compass, "ins.turn")
         assert factor is not None
         return factor
 
@@ -342,19 +342,48 @@ def test_what_a_tie_says_is_linear_as_stated(path: Path) -> None:
     )
 
     def residual(p: Path) -> Array:
-        return anchors.tie_factor(tie, p, unknowns).residual
+        return tie_factor(tie, p, unknowns).residual
 
-    factor = anchors.tie_factor(tie, path, unknowns)
+    factor = tie_factor(tie, path, unknowns)
     assert len(factor.residual) == 30
     for offset, share in ((0, 2e-3), (3, 1e-6)):
         assert_close(of_the_path(factor, offset), by_the_path(residual, path, offset, 1e-5), share)
 
 
+def test_a_delay_of_positions_and_attitudes_is_linear_as_stated(path: Path) -> None:
+    """Stamps late by some milliseconds: rows follow differences of their own residual; a delay that is held is no column."""
+    step_s = 2e-3
+
+    def residuals(delay_s: float) -> tuple[Array, Array]:
+        clock = Clock("late", 0.1, np.array([delay_s]))
+        (course,) = fixes.position_factors(positions(), path, unknowns_of("late"), 0, clock)
+        turn = stated_attitudes.attitude_factor(
+            attitudes(0.0), path, unknowns_of("compass", "late"), MAT_SENSOR_INS, COMPASS, None, clock
+        )
+        assert turn is not None
+        return course.residual, turn.residual
+
+    clock, unknowns = Clock("late", 0.1), Unknowns(INTERVALS)
+    for name, size in (("world.turn", 3), ("world.shift", 3), ("compass", 5)):
+        unknowns.add(name, np.ones(size))
+    size = unknowns.size
+    clock.unknowns(unknowns)
+    Clock("held").unknowns(unknowns)
+    assert unknowns.size == size + 1
+    (course,) = fixes.position_factors(positions(), path, unknowns, 0, clock)
+    turn = stated_attitudes.attitude_factor(attitudes(0.0), path, unknowns, MAT_SENSOR_INS, COMPASS, None, clock)
+    assert turn is not None
+    for factor, ahead, behind in zip((course, turn), residuals(step_s), residuals(-step_s), strict=True):
+        stated = factor.matrix.toarray()[:, unknowns.names["late"]][:, 0]
+        # rates over 25 ms of a motion of 4 rad/s, and a compass that turns with the heading
+        assert_close(stated, (ahead - behind) / (2 * step_s), 0.1)
+
+
 def test_too_few_observations_are_none(path: Path) -> None:
     far = replace(positions(), time_ns=positions().time_ns + 10**12)
-    assert anchors.position_factors(far, path, unknowns_of()) == []
+    assert fixes.position_factors(far, path, unknowns_of()) == []
     late = replace(attitudes(), time_ns=attitudes().time_ns + 10**12)
-    assert anchors.attitude_factor(late, path, unknowns_of("compass"), np.eye(3), COMPASS, None) is None
+    assert stated_attitudes.attitude_factor(late, path, unknowns_of("compass"), np.eye(3), COMPASS, None) is None
 
 
 # Noise -----------------------------------------------------------------------------------------------------------------
@@ -400,9 +429,10 @@ def test_white_noise_on_top_costs_at_most_some_of_the_information() -> None:
 
 def test_normal_equations_are_those_of_the_whitened_rows(path: Path, unit: Unit) -> None:
     unknowns = unknowns_of(*UNIT_NAMES, "compass")
+    unknowns.value["compass"] = COMPASS
     factors = [
         turn_factor(unit, path, unknowns), force_factor(unit, path, unknowns), position_factor(path, unknowns),
-        prior_factor(unknowns, {"compass": COMPASS}),
+        prior_factor(unknowns),
     ]  # fmt: skip
     rows = np.concatenate([f.matrix.toarray() / f.sigma[:, None] for f in factors])
     right = np.concatenate([f.residual / f.sigma for f in factors])

@@ -5,7 +5,7 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from groundproc.estimation.adjustment.planes import TILT_PRIOR, Rows, rows_of
+from groundproc.estimation.observations.planes import TILT_PRIOR, Rows, rows_of
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path, basis

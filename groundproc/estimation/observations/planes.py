@@ -13,7 +13,7 @@ import numpy.typing as npt
 from numba import njit, prange
 from scipy.ndimage import uniform_filter1d
 
-from groundproc.estimation.adjustment.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
+from groundproc.estimation.observations.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.odometry import GROUND, observable

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from groundproc.estimation.adjustment.planes import HUBER, RANGE_SIGMA_M, ROUGHNESS_M, placed
+from groundproc.estimation.observations.planes import HUBER, RANGE_SIGMA_M, ROUGHNESS_M, placed
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.odometry import GROUND
 from groundproc.estimation.odometry.spline import Path

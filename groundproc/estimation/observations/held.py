@@ -1,4 +1,4 @@
-"""Control points and planes in the adjustment: one row for each place that the map's surface has to go through.
+"""A map held to control points and planes: one row for each place that its surface has to go through.
 
 A point on a surface does not fix a point of the cloud, only the surface's distance along its normal. That surface is a plane through
 clusters of many slices, solved for within: distance = survey - sum of shares x clusters, with the variance of both. This is what is
@@ -13,11 +13,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.adjustment.anchors import spots as moments_of
-from groundproc.estimation.adjustment.datum import WIDEST_M, Datum, Spots, find_datum, reach_m
-from groundproc.estimation.adjustment.factors import Factor, RowBuilder, Unknowns, cross
-from groundproc.estimation.adjustment.planes import placed
-from groundproc.estimation.adjustment.surfaces import RADII_M, Near, Surface, near, surfaces
+from groundproc.estimation.observations.datum import WIDEST_M, Datum, Spots, find_datum, reach_m
+from groundproc.estimation.observations.moments import spots as moments_of
+from groundproc.estimation.observations.planes import placed
+from groundproc.estimation.observations.rows import Factor, RowBuilder, Unknowns, cross
+from groundproc.estimation.observations.surfaces import RADII_M, Near, Surface, near, surfaces
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.spline import Path
 from groundproc.flight.control import ControlPoint
@@ -210,85 +210,3 @@ def held_to(
             step = surface.shares @ (moved.world_m[surface.rows] - seen.world_m[surface.rows])
             before[i] = surface.distance_m + step @ surface.along
     return Held(points, spots, datum, before, deflation)
-
-
-def control_report(
-    points: Sequence[ControlPoint], windows: Sequence[Sequence[dict[str, Any]]]
-) -> dict[str, Any] | None:
-    """What quality.json says of the control of a run; None where none was given.
-
-    Parameters
-    ----------
-    points : sequence of ControlPoint
-    windows : sequence of sequence of dict
-        What each window says of each point, or nothing.
-    """
-    if not points:
-        return None
-    told = [_best([window[i] for window in windows if window], point) for i, point in enumerate(points)]
-    by_state = {
-        state: [each for each in told if each["state"] == state]
-        for state in ("used", "check", "rejected", "doubtful", "not seen")
-    }
-    notes = [
-        f"{each['name']} is {abs(each['after_m']):.3f} m off the surface where {each['sigma_m']:.3f} m is expected, and was left out"
-        for each in by_state["rejected"]
-    ]
-    if by_state["doubtful"]:
-        names = ", ".join(each["name"] for each in by_state["doubtful"])
-        notes.append(f"{names} left out, because no other point tells which surface they lie on")
-    if by_state["not seen"]:
-        notes.append(f"no surface seen at {', '.join(each['name'] for each in by_state['not seen'])}")
-    alone = [each["name"] for each in by_state["used"] if each["redundancy"] < UNCHECKED]
-    if alone:
-        notes.append(f"nothing else would tell an error of {', '.join(alone)}")
-    return {
-        "used": _figures(by_state["used"]),
-        "check": _figures(by_state["check"]),
-        "rejected": [each["name"] for each in by_state["rejected"]],
-        "note": "; ".join(notes),
-        "points": told,
-    }
-
-
-UNCHECKED: Final = 0.1
-"""Redundancy below which a blunder would be followed without a sign."""
-
-
-def _best(told: Sequence[dict[str, Any]], point: ControlPoint) -> dict[str, Any]:
-    """Of what several windows say of a point, that with the smallest sigma."""
-    seen = [each for each in told if each["state"] != "not seen"]
-    if seen:
-        return min(seen, key=lambda each: float(each["sigma_m"]))
-    return {"name": point.name, "use": "check" if point.check else "control", "state": "not seen"}
-
-
-def _figures(told: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Number and size of distances."""
-    if not told:
-        return {"count": 0}
-    before = [each["before_m"] for each in told if each["before_m"] is not None]
-    after = [each["after_m"] for each in told]
-    heights = [each["after_m"] for each in told if each["along"][2] == 1.0]
-    return {
-        "count": len(told),
-        "before_rms_m": float(np.sqrt(np.mean(np.square(before)))) if before else None,
-        "after_rms_m": float(np.sqrt(np.mean(np.square(after)))),
-        "height_mean_m": float(np.mean(heights)) if heights else None,
-        "sigma_m": float(np.sqrt(np.mean(np.square([each["sigma_m"] for each in told])))),
-    }
-
-
-def control_warnings(points: Sequence[ControlPoint], windows: Sequence[Sequence[dict[str, Any]]]) -> list[str]:
-    """What is wrong with the control as a whole."""
-    report = control_report(points, windows)
-    if report is None or all(point.check for point in points):
-        return []
-    used, rejected = report["used"]["count"], len(report["rejected"])
-    if not used:
-        return ["none of the control points lies on a surface that was seen: the cloud is where it was without them"]
-    if rejected > used:
-        return [
-            f"{rejected} of {used + rejected} control points contradict the others: coordinates, heights or names may be mixed up"
-        ]
-    return []
