@@ -45,6 +45,12 @@ RANGE: Final = ExtraBytes("range", "u2", "range [m]", 0.002)
 AZIMUTH: Final = ExtraBytes("azimuth", "u2", "azimuth [deg]", 0.01)
 
 
+def range_steps(range_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    """Ranges as the extra bytes hold them, in whole steps of their scale; beyond what 16 bits hold, the largest."""
+    assert RANGE.scale is not None
+    return np.asarray(np.minimum(np.rint(range_m / np.float32(RANGE.scale)), 65535.0), np.uint16)
+
+
 def gps_time_s(utc_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
     """Adjusted standard GPS time [s] of Unix times [ns], shape (n,)."""
     if not len(utc_ns):

@@ -18,16 +18,16 @@ class Points:
         On the trajectory's scale, UTC.
     xyz_m : ndarray, shape (n, 3)
         Local (east, north, up), or easting, northing, height after `project`.
-    range_steps : ndarray of uint16, shape (n,)
-        Range as measured [2 mm].
+    range_m : ndarray of float32, shape (n,)
+        Range as measured.
     intensity, laser, returns : ndarray of uint8, shape (n,)
-        As in `decode.Shots`.
+        As in `Shots`.
     dropped : Dropped
     """
 
     time_ns: npt.NDArray[np.int64]
     xyz_m: Array
-    range_steps: npt.NDArray[np.uint16]
+    range_m: npt.NDArray[np.float32]
     intensity: npt.NDArray[np.uint8]
     laser: npt.NDArray[np.uint8]
     returns: npt.NDArray[np.uint8]
@@ -44,7 +44,7 @@ class Dropped:
     Attributes
     ----------
     no_pose : int
-        The trajectory does not cover their firing.
+        Returns within field of view and range gate that the trajectory does not cover.
     outside_fov : int
     no_return : int
     out_of_range : int

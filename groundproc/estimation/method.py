@@ -13,8 +13,9 @@ from groundproc.estimation.ins import PositionFixes
 from groundproc.flight.flight import Flight
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
-from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import ESTIMATE, read_lasers
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import LaserTable
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -42,6 +43,7 @@ class Given:
     mount : Mount
         Nominal.
     survey : Survey
+    lidar : Lidar
     lasers : LaserTable
         Of the survey's file; the manual's where it names none.
     """
@@ -54,7 +56,8 @@ class Given:
     frame: LocalFrame
     mount: Mount
     survey: Survey
-    lasers: LaserTable = field(default_factory=LaserTable.nominal)
+    lidar: Lidar
+    lasers: LaserTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +71,8 @@ class Estimate:
         The one to place points with: the nominal one where the method estimates none.
     sigma_source : str
         What the trajectory's sigmas are, for the reader of quality.json.
-    lasers : LaserTable
-        Corrections of the single lasers; the manual's table where none are estimated.
+    lasers : LaserTable or None
+        Corrections of the single lasers; None: those of the survey.
     report : dict
         What else there is to say; stands in quality.json under the method's name.
     warning : str
@@ -85,7 +88,7 @@ class Estimate:
     trajectory: Trajectory
     mount: Mount
     sigma_source: str
-    lasers: LaserTable = field(default_factory=LaserTable.nominal)
+    lasers: LaserTable | None = None
     report: dict[str, Any] = field(default_factory=dict)
     warning: str = ""
     products: tuple[Callable[[Path], None], ...] = ()
@@ -112,9 +115,14 @@ def gather(
     fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in placed]
     first = fixes[0]
     frame = LocalFrame(float(first.latitude_deg[0]), float(first.longitude_deg[0]), float(first.height_m[0]))
-    return Given(readers, flight, timeline, placed, fixes, frame, mount, survey, chosen_table(survey))
+    lidar = flight.lidar
+    return Given(
+        readers, flight, timeline, placed, fixes, frame, mount, survey, lidar, chosen_table(survey, lidar.lasers)
+    )
 
 
-def chosen_table(survey: Survey) -> LaserTable:
+def chosen_table(survey: Survey, nominal: LaserTable) -> LaserTable:
     """The lasers as the survey has them: of its file, or the manual's, to begin with where they are to be estimated."""
-    return LaserTable.nominal() if survey.lasers in (None, ESTIMATE) else read_lasers(Path(survey.lasers)).table()
+    if survey.lasers is None or survey.lasers == ESTIMATE:
+        return nominal
+    return read_lasers(Path(survey.lasers)).table(nominal, survey.lasers)

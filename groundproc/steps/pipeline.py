@@ -51,7 +51,6 @@ def process(
     """
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)  # a wrong code is said before the work, not after
-    lasers = chosen_table(survey)
     if poses is None:
         methods.check(survey)
     elif survey.lasers == ESTIMATE:
@@ -66,6 +65,7 @@ def process(
         if poses is None:
             made = methods.estimate(gather(readers, flight, timeline, mount, survey), progress)
         else:
+            lasers = chosen_table(survey, flight.lidar.lasers)
             made = Estimate(read_trajectory(poses), mount, f"as {poses} has them", lasers, method="outside")
         trajectory = made.trajectory
         frame = trajectory.frame

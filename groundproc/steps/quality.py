@@ -9,7 +9,6 @@ import numpy as np
 from flightlog import FORMAT_VERSION, __version__, config
 from flightlog.clock import utc_text
 from flightlog.constants import HOUR_NS
-from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from groundproc import geodesy
 from groundproc.cloud.placing import Tally
@@ -70,6 +69,7 @@ def describe(
         },
         **({made.method: made.report} if made.report else {}),
         "lidar": {
+            "model": flight.lidar.name,
             "packets": tally.packets,
             "packets_outside_every_leg": tally.packets_without_leg,
             "aboard": {
@@ -80,7 +80,11 @@ def describe(
                 "rejected": tally.rejected,
             },
         },
-        "points": {"written": tally.written, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(tally.dropped)},
+        "points": {
+            "written": tally.written,
+            "range_step_m": flight.lidar.range_step_m,
+            "shots_dropped": asdict(tally.dropped),
+        },
     }
 
 

@@ -49,8 +49,8 @@ from groundproc.estimation.surveyed import surveyed, surveyed_control
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
-from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import ESTIMATE
+from groundproc.sensors.shots import LaserTable
 from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
@@ -105,7 +105,7 @@ def estimate(given: Given, progress: Progress, start: Trajectory) -> Estimate:
         warning="; ".join(warnings),
         products=(
             functools.partial(_draw, main, given, trajectory),
-            *(() if corrections is None else (functools.partial(_draw_lasers, corrections),)),
+            *(() if corrections is None else (functools.partial(_draw_lasers, corrections, given.lidar.lasers),)),
         ),
     )
 
@@ -116,10 +116,10 @@ def _draw(run: "Run | CausalRun", given: Given, trajectory: Trajectory, folder: 
     draw_adjustment(folder / "adjustment.png", sheet_of(run, given, trajectory))
 
 
-def _draw_lasers(corrections: Corrections, folder: pathlib.Path) -> None:
+def _draw_lasers(corrections: Corrections, nominal: LaserTable, folder: pathlib.Path) -> None:
     from groundproc.products.laser_plot import draw_lasers
 
-    draw_lasers(folder / "lasers.png", corrections)
+    draw_lasers(folder / "lasers.png", corrections, nominal)
 
 
 @dataclass(slots=True)
@@ -182,7 +182,7 @@ class Run:
     def lasers(self, nominal: LaserTable) -> LaserTable:
         """The lasers as estimated, or as they were given."""
         found = self.corrections()
-        return nominal if found is None else found.file().table()
+        return nominal if found is None else found.file(len(nominal)).table(nominal)
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""

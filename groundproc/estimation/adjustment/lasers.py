@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog.hdl32e import LASERS
 from groundproc.sensors.lasers import LaserCorrections
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+LASERS: Final = 32
+"""The most that are estimated; a sensor with fewer leaves the rest as they were, and one with more is refused before."""
 KINDS: Final = ("range", "elevation")
 """What is estimated of each laser; the unknowns stand in this order, 32 of each."""
 NAMES: Final = tuple(f"lasers.{kind}" for kind in KINDS)
@@ -92,13 +93,15 @@ class Corrections:
         first = KINDS.index(kind) * LASERS
         return slice(first, first + LASERS)
 
-    def file(self) -> LaserCorrections:
-        """What is worth keeping; the others stay as they were."""
+    def file(self, lasers: int = LASERS) -> LaserCorrections:
+        """What is worth keeping, of the sensor's number of lasers; the others stay as they were."""
         values = {}
         for kind, unit, scale in (("range", "m", 1.0), ("elevation", "deg", np.rad2deg(1.0))):
             value, sigma, found = self.of(kind)
             for name, numbers in ((f"{kind}_{unit}", value), (f"sigma_{kind}_{unit}", sigma)):
-                values[name] = tuple(round(float(number), 5) for number in np.where(found, scale * numbers, 0.0))
+                values[name] = tuple(
+                    round(float(number), 5) for number in np.where(found, scale * numbers, 0.0)[:lasers]
+                )
         return LaserCorrections(**values)
 
     def report(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
 from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw, write_trims
 from groundproc.estimation.method import Estimate, Given, Progress
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
