@@ -84,7 +84,7 @@ def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
         trajectory,
         mount,
         begun.sigma_source if main.is_worse() else main.SIGMA_SOURCE,
-        main.lasers(given.corrections),
+        main.lasers(given.corrections, len(given.lidar.lasers)),
         mount_source=main.mount_source(given.mount_source),
         mount_sigma=main.mount_sigma(given.mount),
         report=main.report(given.mount),
@@ -184,10 +184,10 @@ class Run:
         """Whether the mount is estimated: it is not without the autopilot's gyro, nor where what the run began from is used."""
         return "ins.turn" in self.windows[0].values and not self.is_worse()
 
-    def lasers(self, nominal: LaserCorrections) -> LaserCorrections:
-        """Corrections of the lasers as estimated, or as they were given."""
+    def lasers(self, nominal: LaserCorrections, count: int) -> LaserCorrections:
+        """Corrections of the sensor's lasers, so many, as estimated, or as they were given."""
         found = self.corrections()
-        return nominal if found is None or self.is_worse() else found.file()
+        return nominal if found is None or self.is_worse() else found.file(count)
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""
@@ -366,8 +366,9 @@ class CausalRun:
     def corrections(self) -> None:
         """The lasers are taken as they are given."""
 
-    def lasers(self, nominal: LaserCorrections) -> LaserCorrections:
+    def lasers(self, nominal: LaserCorrections, count: int) -> LaserCorrections:
         """As they were given."""
+        del count
         return nominal
 
     def mount_source(self, nominal: str) -> str:
