@@ -225,3 +225,13 @@ def _filled(
     if both.any() and missing.any():
         values[missing] = second[missing] + (values[both] - second[both]).mean(axis=0)
     return np.asarray(known | (second_known if both.any() else known))
+
+
+def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) -> Array:
+    """Where to begin with the bias of the gyro that carries the motion: its mean difference from the autopilot's, which has a small one."""
+    if own is None or other is None or motion.source != own.name:
+        return np.zeros(3)
+    rate, known = on_grid(other.time_ns, other.rate_rad_s, motion.start_ns, len(motion))
+    own_rate, own_known = on_grid(own.time_ns, own.rate_rad_s, motion.start_ns, len(motion))
+    both = known & own_known
+    return np.asarray((own_rate - rate)[both].mean(axis=0)) if both.any() else np.zeros(3)

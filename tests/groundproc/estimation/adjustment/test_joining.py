@@ -9,7 +9,6 @@ import pytest
 
 from flightlog import frames
 from flightlog.constants import NS_PER_S
-from groundproc.estimation.adjustment import adjusted
 from groundproc.estimation.adjustment.joining import (
     Joined,
     Stiffness,
@@ -20,6 +19,7 @@ from groundproc.estimation.adjustment.joining import (
     stiffness_of,
     tilt_factor,
 )
+from groundproc.estimation.adjustment.pace import Pace
 from groundproc.estimation.adjustment.patches import CHUNK, KEPT, PATCH_M, Patches, all_of, coarse, patches_of
 from groundproc.estimation.observations.attitudes import COMPASS_PRIOR, StatedAttitudes
 from groundproc.estimation.observations.fixes import Fixes
@@ -314,7 +314,7 @@ def test_only_ground_of_more_than_one_window_is_taken(windows_wrong: tuple[Path,
 
 def test_progress_comes_to_the_bytes_that_were_read() -> None:
     told: list[int] = []
-    pace = adjusted.Pace(lambda stage, done: told.append(done))
+    pace = Pace(lambda stage, done: told.append(done))
     for window in range(3):
         for _ in range(50):
             pace.read("adjust", 1001 + window)
