@@ -34,7 +34,7 @@ from groundproc.live.motion import GrowingMotion, MotionBuilder, Samples
 from groundproc.live.slicer import Shots, Slicer
 from groundproc.live.start import RoughPoses, autopilot_poses, gyro_offset
 from groundproc.live.telemetry import Telemetry
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

@@ -8,14 +8,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from flightlog.hdl32e import RANGE_LSB_M
 from groundproc import geodesy
 from groundproc.cloud import placing
+from groundproc.flight.lidar import lidar_of
+from groundproc.flight.shots import Tally, shots
 from groundproc.flight.timeline import tied
 from groundproc.geodesy import LocalFrame
 from groundproc.products import chosen, plain
 from groundproc.products.product import Context, Making, streamed
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import Gate
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Request, Step
@@ -54,26 +56,29 @@ def work(run: Run, folders: Folders) -> None:
     made = run.estimate
     timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
     projection = projection_of(made.trajectory.frame, run.survey)
-    survey, tally = run.survey, placing.Tally()
+    survey, tally = run.survey, Tally()
     context = Context(run.folder, run.folder, survey, made, projection, inputs=run.names)
-    packets = placing.chunks(run.readers, timeline, tally, functools.partial(run.progress, "place"))
+    lidar = lidar_of(run.readers)
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
+    lasers, told = made.corrections.table(lidar.lasers), functools.partial(run.progress, "place")
+    seen = shots(run.readers, timeline, gate, lasers, tally, told)
     with contextlib.ExitStack() as stack:
         sinks: list[Making] = []
         for each in chosen(survey.products):
             if each.name in folders:
                 own = replace(context, folder=folders[each.name])
                 sinks += stack.enter_context(streamed([each], own))
-        placed = placing.place(packets, made.trajectory, made.mount, projection, sinks, gate=gate, lasers=made.lasers)
+        placed = placing.place(seen, made.trajectory, made.mount, projection, sinks)
     if WHOLE in folders:
-        _tell(folders[WHOLE] / FOUND, projection, tally, placed)
+        _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed)
 
 
-def _tell(path: Path, projection: geodesy.Projection, tally: placing.Tally, placed: placing.Placed) -> None:
+def _tell(path: Path, lidar: Lidar, projection: geodesy.Projection, tally: Tally, placed: placing.Placed) -> None:
     """Write what became of the shots."""
     found = {
         "crs": {"epsg": projection.crs.to_epsg(), "name": projection.crs.name},
         "lidar": {
+            "model": lidar.name,
             "packets": tally.packets,
             "packets_outside_every_leg": tally.packets_without_leg,
             "aboard": {
@@ -84,7 +89,11 @@ def _tell(path: Path, projection: geodesy.Projection, tally: placing.Tally, plac
                 "rejected": tally.rejected,
             },
         },
-        "points": {"written": placed.points, "range_step_m": RANGE_LSB_M, "shots_dropped": asdict(placed.dropped)},
+        "points": {
+            "written": placed.points,
+            "range_step_m": lidar.range_step_m,
+            "shots_dropped": asdict(placed.dropped),
+        },
     }
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
