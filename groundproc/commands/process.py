@@ -123,7 +123,11 @@ def _print_states(found: Sequence[State], folder: Path, as_json: bool) -> None:
         return
     rows = [(state.step.partition(": "), state) for state in found]
     width = max(len(part or step) + 2 * bool(part) for (step, _, part), _ in rows) + 2
+    shown = ""
     for (step, _, part), state in rows:
+        if part and step != shown:
+            print(step)
+        shown = step
         when = f"{state.finished}, {state.seconds:.1f} s" if state.finished else ""
         print(f"{'  ' + part if part else step:<{width}}{state.state:<9}{'; '.join(state.reasons) or when}")
         if state.outputs and state.outputs != (part,):

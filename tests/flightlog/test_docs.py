@@ -20,7 +20,7 @@ def generate() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("page", ["log-format.md", "dimensions.md", "products.md"])
+@pytest.mark.parametrize("page", ["log-format.md", "dimensions.md", "products.md", "survey.md"])
 def test_a_page_is_what_its_table_says_now(generate: ModuleType, page: str) -> None:
     assert (DOCS / page).read_text(encoding="utf-8") == generate.PAGES[page]()
 
