@@ -10,7 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.inertial.readings import read
+from groundproc.estimation.inertial.solution import Solution, solve
+from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation.legs import leg_by_leg
+from groundproc.estimation.method import Given, Method, Progress
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     COMPASS,
     COURSE,
@@ -20,11 +25,6 @@ from groundproc.estimation.inertial.model import (
     GYRO_MATRIX,
     POSITION,
 )
-from groundproc.estimation.inertial.readings import read
-from groundproc.estimation.inertial.solution import Solution, solve
-from groundproc.estimation.ins import PositionFixes
-from groundproc.estimation.legs import leg_by_leg
-from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg
@@ -94,7 +94,7 @@ def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[Ou
         mat_ins_lidar=leg.sync.mat_ins_lidar,
         outside=outside,
     )
-    return solve(readings)
+    return solve(readings, given=given, leg=leg)
 
 
 def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:

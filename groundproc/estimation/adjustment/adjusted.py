@@ -3,6 +3,7 @@
 packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass; and the sigma of each.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Final
 
@@ -31,7 +32,7 @@ from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.attitudes import attitude_track
 from groundproc.estimation.observations.fixes import position_track
-from groundproc.estimation.observations.observation import Flown
+from groundproc.estimation.observations.observation import Flown, Observation
 from groundproc.estimation.observations.rows import turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
@@ -45,8 +46,16 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 Array = npt.NDArray[np.float64]
 
 
-def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
+def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observation] = ()) -> Estimate:
     """Adjust every run of the lidar's clock, begun from the autopilot's solution.
+
+    Parameters
+    ----------
+    given : Given
+    progress : Progress
+    more : sequence of Observation
+        From elsewhere, beside those of the log and of the survey: poses of images, steps of another odometry. Not used where the
+        survey asks for nothing of the future.
 
     Raises
     ------
@@ -57,7 +66,7 @@ def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
     start = begun.trajectory
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
-    adjust = causal_run if given.survey.causal else adjust_run
+    adjust = causal_run if given.survey.causal else functools.partial(adjust_run, more=more)
     for number in sorted({leg.run for leg in given.placed}):
         legs = [leg for leg in given.placed if leg.run == number]
         try:
@@ -114,15 +123,16 @@ def adjust_run(
     start: Trajectory,
     progress: Progress,
     exact: tuple[str, ...] = (),
+    more: Sequence[Observation] = (),
 ) -> Run:
     """Adjust one run of the lidar's clock, window by window as the odometry goes on: the memory is that of a window.
 
-    `exact` names globals whose covariance is wanted exactly.
+    `exact` names globals whose covariance is wanted exactly; `more` are observations of neither the log nor the survey.
     """
     motion, own, other = base_motion(given, max(legs, key=lambda leg: leg.sync.samples), given.flight.runs[number])
     units = {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None}
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
-    observations = observations_of(Flown(given, legs, units))
+    observations = [*observations_of(Flown(given, legs, units)), *more]
     sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
     tracker = Tracker(
         motion, start, mat, lever, gyro_offset(motion, own, other), position_track(given, legs[0]),

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numba import njit
 
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     FIX_POSITION,
     FIX_VELOCITY,

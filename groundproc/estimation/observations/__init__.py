@@ -5,8 +5,9 @@ A kind is a module with one or both of
     of_run(flown: Flown) -> list[Observation]    for the adjustment: what of this kind a run of the lidar's clock has
     of_leg(heard: Heard) -> list[Measured]       for the smoother: what of this kind a leg has
 
-and one name in `KINDS`. The engines (adjustment.batch, adjustment.joining, inertial.solution) know lists of observations and nothing of
-their kinds. docs/methods/observations.md has an example.
+and one name in `KINDS`; observations of no file of the survey are handed to `adjusted_estimate`. The engines (adjustment.batch,
+adjustment.joining, inertial.solution) know lists of observations and nothing of their kinds. docs/methods/observations.md has an
+example.
 
 observation, measured   what an observation is to the adjustment and to the smoother
 rows, moments, source   sparse rows; times on a path; clock and lever arm of a source
@@ -23,10 +24,21 @@ import importlib
 from types import ModuleType
 from typing import Any, Final
 
+from groundproc.estimation.observations.measured import Heard, Measured
 from groundproc.estimation.observations.observation import Flown, Observation
 
 KINDS: Final[dict[str, str]] = {
-    name: f"{__name__}.{name}" for name in ("fixes", "inertial", "attitudes", "outside", "control")
+    name: f"{__name__}.{name}"
+    for name in (
+        "fixes",
+        "inertial",
+        "attitudes",
+        "outside",
+        "control",
+        "barometer",
+        "standing",
+        "course",
+    )
 }
 """Module of each kind, imported when it is asked for; unknowns and rows stand in this order."""
 
@@ -34,6 +46,11 @@ KINDS: Final[dict[str, str]] = {
 def observations_of(flown: Flown) -> list[Observation]:
     """All that the adjustment of a run goes by besides the lidar's planes."""
     return [each for module in _modules("of_run") for each in module.of_run(flown)]
+
+
+def measured_of(heard: Heard) -> list[Measured]:
+    """All that the smoother of a leg goes by besides the inertial sensors, which carry its states from node to node."""
+    return [each for module in _modules("of_leg") for each in module.of_leg(heard)]
 
 
 def _modules(function: str) -> list[ModuleType]:

@@ -9,10 +9,13 @@ import numpy.typing as npt
 
 from flightlog import frames
 from groundproc.estimation import ins
+from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, Stated
 from groundproc.estimation.observations.moments import means, poses, rates, seconds, spots, within
 from groundproc.estimation.observations.observation import Flown, Observation, State
 from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, eye, whitened
 from groundproc.estimation.observations.source import Clock
+from groundproc.estimation.observations.states import ATTITUDE, HEADING, TILT
+from groundproc.estimation.observations.states import COMPASS as CURVE
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Attitudes
 from groundproc.flight.timeline import Leg
@@ -152,3 +155,37 @@ def attitude_track(leg: Leg) -> Attitudes | None:
         return None
     _, time_ns, quat, _ = ins.attitudes(leg.boot)
     return Attitudes(leg.utc_from_boot(time_ns), quat, ATTITUDE_SIGMA_RAD, ATTITUDE_TAU_S)
+
+
+NOISE: Final = {
+    "tilt": Learnt("tilt_noise_rad", np.deg2rad(0.02), np.deg2rad(2.0)),
+    "heading": Learnt("heading_noise_rad", np.deg2rad(0.02), np.deg2rad(5.0)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeRows(Measured):
+    """The same in the smoother: tilt and heading apart, their lasting errors and the compass's curve being states."""
+
+    stated: Stated
+    learnt: Mapping[str, Learnt] = field(default_factory=lambda: NOISE)
+
+    def rows(self, rows: Rows) -> None:
+        """Two rows of tilt, about the right and the forward axis of the heading, and one of heading."""
+        place, inside = rows.at(self.stated.attitude_s)
+        left = frames.quat_log(frames.quat_multiply(self.stated.quat[inside], frames.quat_inverse(place.quat)))
+        heading, _, _ = frames.attitude_of(frames.mat_from_quat(place.quat))
+        sine, cosine = np.sin(heading), np.cos(heading)
+        for number, (east, north) in enumerate(((cosine, -sine), (sine, cosine))):
+            tilted = [(ATTITUDE, east), (ATTITUDE + 1, north), (TILT + number, 1.0)]
+            lean = left[:, 0] * east + left[:, 1] * north
+            rows.add("tilt", place.node, tilted, lean, rows.model.tilt_noise_rad)
+        # headings count clockwise, rotations about the upward axis the other way
+        columns: list[tuple[int, Any]] = [(ATTITUDE + 2, 1.0), (HEADING, -1.0)]
+        columns += [(CURVE + i, -term) for i, term in enumerate(compass_terms(heading).T)]
+        rows.add("heading", place.node, columns, left[:, 2], rows.model.heading_noise_rad)
+
+
+def of_leg(heard: Heard) -> list[Measured]:
+    """The attitudes of a leg."""
+    return [AttitudeRows(heard.stated)]

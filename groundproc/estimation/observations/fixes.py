@@ -1,7 +1,7 @@
 """The autopilot's GNSS positions: metres, with errors that last for a minute and more."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -10,13 +10,23 @@ import numpy.typing as npt
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.method import Given
+from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, Stated, turned_by
 from groundproc.estimation.observations.moments import means, poses, seconds, spots, velocities, within
 from groundproc.estimation.observations.observation import Flown, Observation, Outcome, State
 from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.observations.source import Clock
+from groundproc.estimation.observations.states import (
+    ATTITUDE,
+    FIX_AGE,
+    FIX_POSITION,
+    FIX_VELOCITY,
+    POSITION,
+    VELOCITY,
+)
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Positions
 from groundproc.flight.autopilot import Boot
+from groundproc.flight.sync.tracks import low_pass
 from groundproc.flight.timeline import Leg
 
 Array = npt.NDArray[np.float64]
@@ -239,3 +249,48 @@ def measured(boot: Boot, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
     for regained_ns in gps_ns[1:][fixed[1:] & ~fixed[:-1]].tolist():
         good &= (time_ns < regained_ns) | (time_ns > regained_ns + RECOVERY_NS)
     return np.asarray(good if good.sum() >= 2 else np.ones(len(time_ns), np.bool_))
+
+
+NOISE: Final = {
+    "fix position": Learnt("fix_noise_m", 0.02, 5.0),
+    "fix velocity": Learnt("fix_velocity_noise_m_s", 0.02, 3.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FixRows(Measured):
+    """The same in the smoother, with the velocities that come along: there errors that last are states, and so is the fixes' age."""
+
+    stated: Stated
+    learnt: Mapping[str, Learnt] = field(default_factory=lambda: NOISE)
+
+    def rows(self, rows: Rows) -> None:
+        """Positions, and velocities where there are any."""
+        stated, model = self.stated, rows.model
+        place, inside = rows.at(stated.fix_s)
+        mat = frames.mat_from_quat(place.quat)
+        arm = mat @ stated.lever_m
+        by_turn = turned_by(arm)
+        left = stated.fix_m[inside] - place.position_m - arm
+        for axis in range(3):
+            columns = [(POSITION + axis, 1.0), (FIX_POSITION + axis, 1.0), (FIX_AGE, -place.velocity_m_s[:, axis])]
+            if stated.lever_m.any():
+                columns += [(ATTITUDE + i, by_turn[:, axis, i]) for i in range(3)]
+            rows.add("fix position", place.node, columns, left[:, axis], model.fix_noise_m)
+        if stated.fix_velocity_m_s is None:
+            return
+        swing = np.einsum("nij,nj->ni", mat, np.cross(place.rate_rad_s, stated.lever_m))
+        left = stated.fix_velocity_m_s[inside] - place.velocity_m_s - swing
+        step_s = rows.step_ns * 1e-9
+        gaining = np.gradient(low_pass(rows.reference.velocity_m_s, 1.0, 1.0 / step_s), step_s, axis=0)[place.node]
+        for axis in range(3):
+            columns = [(VELOCITY + axis, 1.0), (FIX_VELOCITY + axis, 1.0), (FIX_AGE, -gaining[:, axis])]
+            # the error of a position's own velocity is how fast the position's error changes, its decay included
+            if stated.linked:
+                columns.append((FIX_POSITION + axis, -1.0 / model.fix_tau_s))
+            rows.add("fix velocity", place.node, columns, left[:, axis], model.fix_velocity_noise_m_s)
+
+
+def of_leg(heard: Heard) -> list[Measured]:
+    """The positions of a leg."""
+    return [FixRows(heard.stated)]

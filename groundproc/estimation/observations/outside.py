@@ -6,7 +6,7 @@ shape from one second to the next, which the lidar knows better, is left to it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -14,11 +14,13 @@ import numpy.typing as npt
 from scipy import sparse
 
 from flightlog import frames
+from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, turned_by
 from groundproc.estimation.observations.moments import means, poses, rates, seconds, spots, velocities, within
 from groundproc.estimation.observations.observation import Flown, Observation, Outcome, State
 from groundproc.estimation.observations.pieces import laid_by_pieces, seen_slices
 from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, cross, eye
 from groundproc.estimation.observations.source import Arm, Clock
+from groundproc.estimation.observations.states import ATTITUDE, POSITION, VELOCITY
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
@@ -340,3 +342,43 @@ def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: 
     return Factor(
         name, blocks @ residual.ravel(), (blocks @ matrix).tocsr(), np.ones(residual.size), errors=Errors.ANCHOR
     )
+
+
+@dataclass(frozen=True, slots=True)
+class OutsideRows(Measured):
+    """The same in the smoother, with velocities where they are stated. Errors are taken as they come: the smoother knows no map."""
+
+    fixes: OutsideFixes
+    start_ns: int
+    learnt: Mapping[str, Learnt] = field(default_factory=dict)
+
+    def rows(self, rows: Rows) -> None:
+        """Positions, velocities and attitudes, each with its covariance."""
+        fixes = self.fixes
+        time_s: Array = (fixes.time_ns - self.start_ns).astype(np.float64) * 1e-9
+        place, inside = rows.at(time_s)
+        mat = frames.mat_from_quat(place.quat)
+        arm = mat @ fixes.lever_arm_m
+        rows.add_whitened(
+            "outside position",
+            place.node,
+            fixes.covariance_m2[inside],
+            fixes.position_m[inside] - place.position_m - arm,
+            [(POSITION, None), (ATTITUDE, turned_by(arm))],
+        )
+        if fixes.velocity_m_s is not None and fixes.velocity_covariance_m2_s2 is not None:
+            swing = np.einsum("nij,nj->ni", mat, np.cross(place.rate_rad_s, fixes.lever_arm_m))
+            left = fixes.velocity_m_s[inside] - place.velocity_m_s - swing
+            covariance = fixes.velocity_covariance_m2_s2[inside]
+            rows.add_whitened("outside velocity", place.node, covariance, left, [(VELOCITY, None)])
+        if fixes.quat_local_ins_wxyz is not None and fixes.attitude_covariance_rad2 is not None:
+            left = frames.quat_log(
+                frames.quat_multiply(fixes.quat_local_ins_wxyz[inside], frames.quat_inverse(place.quat))
+            )
+            covariance = fixes.attitude_covariance_rad2[inside]
+            rows.add_whitened("outside attitude", place.node, covariance, left, [(ATTITUDE, None)])
+
+
+def of_leg(heard: Heard) -> list[Measured]:
+    """One for each source."""
+    return [OutsideRows(fixes, heard.stated.start_ns) for fixes in heard.stated.outside]

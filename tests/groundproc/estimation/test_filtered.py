@@ -19,9 +19,9 @@ from flightlog.mavlink import Frame
 from flightlog.mount import Mount
 from groundproc.estimation import direct, filtered, ins, methods
 from groundproc.estimation.inertial import readings
-from groundproc.estimation.inertial.model import ATTITUDE, GYRO_BIAS, POSITION
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.method import Given, gather
+from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, POSITION
 from groundproc.flight import autopilot
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from groundproc.estimation.inertial import imu, kalman
 from groundproc.estimation.inertial.imu import Samples
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.inertial.readings import normal_gravity, pressure_height
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     FIX_POSITION,
     FIX_VELOCITY,
@@ -23,7 +24,6 @@ from groundproc.estimation.inertial.model import (
     Model,
     start_covariance,
 )
-from groundproc.estimation.inertial.readings import normal_gravity, pressure_height
 
 Array = npt.NDArray[np.float64]
 NODES, STEP_S, GRAVITY = 25, 0.05, 9.81

@@ -8,7 +8,13 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from groundproc.estimation.observations.outside import LEAST_SIGMA_M, Outside, observed, outside_factors
+from groundproc.estimation.observations.outside import (
+    LEAST_SIGMA_M,
+    LEAST_SIGMA_RAD,
+    Outside,
+    observed,
+    outside_factors,
+)
 from groundproc.estimation.observations.pieces import laid_by_pieces
 from groundproc.estimation.observations.rows import Factor, Unknowns, turned
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
@@ -179,3 +185,66 @@ def test_pieces_between_blind_stretches_are_laid_on_the_positions(path: Path) ->
     assert np.abs(wrong[:-1][seen]).max() < 0.01
     assert laid(np.ones(INTERVALS, np.bool_)) is strayed
     assert laid(view, sigma_m=1.0) is strayed
+
+
+def test_a_full_covariance_of_a_pose_ties_position_to_attitude(path: Path) -> None:
+    """One pose a second, off by known amounts: the cost is that of the dense 6 x 6, but for the factor that lasting errors take."""
+    given = outside(every_s=1.0)
+    count = len(given.time_ns)
+    crossed = np.array([[2e-5, 0.0, 0.0], [0.0, -1e-5, 5e-6], [0.0, 0.0, 1e-5]])
+    off, turn = np.array([0.02, -0.01, 0.03]), np.array([1e-3, 2e-3, -1e-3])
+    assert given.quat is not None
+    assert given.attitude_covariance_rad2 is not None
+    wrong = replace(
+        given,
+        position_m=given.position_m - off,
+        quat=frames.quat_multiply(np.tile(frames.quat_exp(-turn[None]), (count, 1)), given.quat),
+        cross_covariance=np.tile(crossed, (count, 1, 1)),
+    )
+    (factor,) = factors(wrong, path)
+    assert factor.name == "outside pose"
+    dense = np.block(
+        [
+            [given.covariance_m2[0] + LEAST_SIGMA_M**2 * np.eye(3), crossed],
+            [crossed.T, given.attitude_covariance_rad2[0] + LEAST_SIGMA_RAD**2 * np.eye(3)],
+        ]
+    )
+    residual = np.concatenate([off, turn])
+    keep = np.exp(-1.0 / 20.0)
+    expected = residual @ np.linalg.solve(dense, residual) * (1.0 - keep) / (1.0 + keep)
+    # the path is straight between poses of 5 ms: 12 um and 50 urad of it
+    np.testing.assert_allclose(np.square(factor.residual.reshape(-1, 6)).sum(axis=1), expected, rtol=0.05)
+    apart = factors(replace(wrong, cross_covariance=None), path)
+    assert [each.name for each in apart] == ["outside position", "outside attitude"]
+    # the rows are those of the two, whitened together
+    white = np.linalg.inv(np.linalg.cholesky(dense))
+    alone = [np.linalg.cholesky(dense[k : k + 3, k : k + 3]) for k in (0, 3)]
+    plain = np.concatenate(
+        [lower @ each.matrix.toarray().reshape(count, 3, -1) for lower, each in zip(alone, apart, strict=True)], 1
+    )
+    np.testing.assert_allclose(factor.matrix.toarray().reshape(count, 6, -1), white @ plain, atol=1e-6)
+
+
+def test_each_source_has_a_clock_and_a_lever_arm_of_its_own(path: Path) -> None:
+    del path
+    found = Unknowns(INTERVALS)
+    for source in (observed(outside()), observed(replace(outside(), delay_sigma_s=0.02), "images", arm_sigma_m=0.03)):
+        source.unknowns(found)
+    assert {name: sigma.tolist() for name, sigma in found.sigma.items()} == {
+        "outside.delay": [0.01], "images.delay": [0.02], "images.lever": [0.03] * 3,
+    }  # fmt: skip
+    assert found.unit == {"outside.delay": "s", "images.delay": "s", "images.lever": "m"}
+    source = observed(outside(), "images", arm_sigma_m=0.03)
+    solution = {
+        "images.delay": np.array([0.004]),
+        "images.lever": np.array([0.01, 0.0, -0.02]),
+        "outside.delay": np.ones(1),
+    }
+    source.take(solution, Path(0, np.zeros((1, 4)), np.zeros((1, 3))))
+    np.testing.assert_allclose(source.clock.delay_s, [0.004])
+    np.testing.assert_allclose(source.arm.lever_m, LEVER + np.array([0.01, 0.0, -0.02]))
+    joined = source.joined({"images.delay": np.array([0.005]), "images.lever": LEVER}, [])
+    held = Unknowns(INTERVALS)
+    joined.unknowns(held)
+    assert not held.names
+    np.testing.assert_allclose(joined.arm.lever_m, LEVER)
