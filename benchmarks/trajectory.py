@@ -43,7 +43,7 @@ from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
 from groundproc.flight.sync.result import Sync
 from groundproc.flight.timeline import legs
-from groundproc.sensors.hdl32e import LaserTable
+from groundproc.sensors.shots import LaserTable
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory
 

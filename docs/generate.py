@@ -1,21 +1,25 @@
 """Writes the pages that are tables of the programs, so that page and programs cannot differ.
 
 log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
-groundproc/products, the table in methods/observations.md from that of groundproc/estimation/observations. Run it after a change of these:
-python docs/generate.py
+groundproc/products, survey.md from the dataclasses of groundproc/survey, the table in methods/observations.md from the registry of
+groundproc/estimation/observations. Run it after a change of these: python docs/generate.py
 """
 
+import dataclasses
 import importlib
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from flightlog.records import FORMAT_VERSION, TABLE, RecordType
 from groundproc import products
 from groundproc.cloud import dimensions
 from groundproc.cloud.dimensions import Dimension
 from groundproc.estimation import observations
+from groundproc.survey import SECTIONS, Survey, sample
+from groundproc.survey.dynamic import DynamicOptions
+from groundproc.survey.setting import command_of, default_of, value_text
 
 DOCS: Final = Path(__file__).parent
 
@@ -191,8 +195,80 @@ def observations_page() -> str:
     return _KINDS.sub(lambda found: found[1] + "\n".join(rows) + "\n" + found[2], before)
 
 
+_SURVEY: Final = """\
+# What you choose: survey.yaml
+
+<!-- Made by docs/generate.py from the dataclasses of groundproc/survey: change those, not this. -->
+
+`swath process LOG -o DIR --config survey.yaml` reads this file. Every key is optional. An option on the command line goes before the file.
+`swath init LOG -o survey.yaml` writes one for a flight, with what the log tells about each option. A name of a file in it is looked for
+beside it. An unknown key, a value that cannot be, and an option that the chosen method would not look at are errors.
+
+`swath process --help` lists the options of the command line. `swath completion bash` (or `zsh`, `fish`) prints a script that completes
+them.
+"""
+
+
+def survey_page() -> str:
+    """docs/survey.md: every option, step by step, and the whole file."""
+    parts = [_SURVEY]
+    for section in SECTIONS:
+        assert section.__doc__ is not None
+        title, _, about = section.__doc__.splitlines()[0].partition(": ")
+        parts += [f"\n## {title}\n", f"{about[0].upper()}{about[1:]}\n"]
+        parts += ["| key | command line | default | what it is |", "|---|---|---|---|"]
+        parts += [_option_row(field) for field in dataclasses.fields(section)]
+    parts += [
+        "",
+        "## Method dynamic",
+        "",
+        "Keys below `dynamic:`.",
+        "",
+        "| key | default | what it is |",
+        "|---|---|---|",
+    ]
+    parts += _nested_rows(DynamicOptions(), "")
+    parts += ["", "## The whole file", "", "```yaml", sample(Survey(), {}).rstrip(), "```", ""]
+    return "\n".join(parts)
+
+
+def _option_row(field: "dataclasses.Field[Any]") -> str:
+    command, value = command_of(field), default_of(field)
+    flag = isinstance(value, bool)
+    words = ", ".join(f"`{word}{'' if flag else f' {_value_name(field)}'}`" for word in command.words)
+    default = "see below" if dataclasses.is_dataclass(value) else f"`{value_text(value)}`"
+    return f"| `{field.name}` | {words or 'not there'} | {default} | {_cell(field)} |"
+
+
+def _value_name(field: "dataclasses.Field[Any]") -> str:
+    choices = field.metadata.get("choices")
+    return "\\|".join(choices) if choices else command_of(field).metavar
+
+
+def _nested_rows(options: Any, above: str) -> list[str]:
+    rows: list[str] = []
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            rows += _nested_rows(value, f"{field.name}.")
+        else:
+            rows.append(f"| `{above}{field.name}` | `{value_text(value)}` | {_cell(field)} |")
+    return rows
+
+
+def _cell(field: "dataclasses.Field[Any]") -> str:
+    """What an option is, its choices and its bounds."""
+    about, rules = field.metadata["about"], field.metadata
+    if rules.get("choices"):
+        about += f" ({', '.join(f'`{choice}`' for choice in rules['choices'])})"
+    low, high = rules.get("minimum"), rules.get("maximum")
+    if low is not None or high is not None:
+        about += f" ({'' if low is None else f'{low:g}'} to {'' if high is None else f'{high:g}'})"
+    return about.replace("|", "\\|")
+
+
 PAGES: Final[dict[str, Callable[[], str]]] = {
-    "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page,
+    "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
     "methods/observations.md": observations_page,
 }  # fmt: skip
 

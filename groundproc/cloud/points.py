@@ -21,7 +21,7 @@ class Dropped:
     Attributes
     ----------
     no_pose : int
-        The trajectory does not cover their firing.
+        Returns within field of view and range gate that the trajectory does not cover.
     outside_fov : int
     no_return : int
     out_of_range : int

@@ -240,13 +240,11 @@ def _pack_scaled(values: Any, per_unit: float, low: int, high: int, no_data: int
     """Fill one attribute with whole steps; gives how many lie beyond what it can hold."""
     beyond = 0
     for i in range(len(values)):
-        if np.isnan(values[i]):
-            out[i] = no_data
-            beyond += not has_no_data
-            continue
         steps = np.rint(values[i] * per_unit)
         if low <= steps <= high:
             out[i] = np.int64(steps)
+        elif has_no_data and np.isnan(steps):
+            out[i] = no_data
         else:
             beyond += 1
     return beyond

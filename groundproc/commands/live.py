@@ -142,7 +142,7 @@ def _say_once() -> Callable[[bool], None]:
 def _options(arguments: argparse.Namespace) -> Any:
     from groundproc.commands.values import field_of_view
     from groundproc.live.estimator import Options
-    from groundproc.sensors.hdl32e import Gate
+    from groundproc.sensors.shots import Gate
 
     fov = field_of_view(arguments.fov) if arguments.fov else (255.0, 105.0)
     patience_ns = 400_000_000 if arguments.follow is None else 2_000_000_000

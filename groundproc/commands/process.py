@@ -121,11 +121,17 @@ def _print_states(found: Sequence[State], folder: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"folder": str(folder), "steps": [asdict(state) for state in found]}, indent=2))
         return
-    for state in found:
+    rows = [(state.step.partition(": "), state) for state in found]
+    width = max(len(part or step) + 2 * bool(part) for (step, _, part), _ in rows) + 2
+    shown = ""
+    for (step, _, part), state in rows:
+        if part and step != shown:
+            print(step)
+        shown = step
         when = f"{state.finished}, {state.seconds:.1f} s" if state.finished else ""
-        print(f"{state.step:<12}{state.state:<9}{'; '.join(state.reasons) or when}")
-        if state.outputs:
-            print(f"{'':<21}{', '.join(state.outputs)}")
+        print(f"{'  ' + part if part else step:<{width}}{state.state:<9}{'; '.join(state.reasons) or when}")
+        if state.outputs and state.outputs != (part,):
+            print(f"{'':<{width + 9}}{', '.join(state.outputs)}")
 
 
 def _report(quality: dict[str, Any], folder: Path) -> str:

@@ -12,8 +12,9 @@ from groundproc.estimation.ins import PositionFixes
 from groundproc.flight.flight import Flight
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
-from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections, read_lasers
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import LaserTable
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 
@@ -59,9 +60,14 @@ class Given:
     mount_source: str = "as given"
 
     @property
+    def lidar(self) -> Lidar:
+        """The lidar that was flown."""
+        return self.flight.lidar
+
+    @property
     def lasers(self) -> LaserTable:
         """The lasers to begin with: the manual's table with the corrections."""
-        return self.corrections.table()
+        return self.corrections.table(self.lidar.lasers)
 
 
 @dataclass(frozen=True, slots=True)

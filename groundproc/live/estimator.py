@@ -24,7 +24,7 @@ from groundproc.live.slicer import Shots, Slicer
 from groundproc.live.start import CarriedPoses
 from groundproc.live.telemetry import Telemetry
 from groundproc.live.units import Chosen, Units
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

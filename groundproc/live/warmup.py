@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flightlog import hdl32e, records
+from groundproc import sensors
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.odometry import Odometry
 from groundproc.estimation.odometry.slices import Slice
@@ -12,7 +12,7 @@ from groundproc.geodesy import LocalFrame
 from groundproc.live.motion import GrowingMotion
 from groundproc.live.slicer import Slicer
 from groundproc.live.voxelcloud import VoxelCloud
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 from groundproc.trajectory.trajectory import Trajectory
 
 
@@ -38,10 +38,9 @@ def warm_up() -> None:
     cloud.add(
         np.arange(len(floor)) * STEP_NS // 100, floor, np.zeros(len(floor), np.uint8), Path(0, quat, rest[: STEPS + 1])
     )
-    for mode in (hdl32e.ReturnMode.STRONGEST, hdl32e.ReturnMode.DUAL):
-        packets = np.zeros(2, records.SCAN_PACKET_DTYPE)
-        packets["data"]["return_mode"] = mode
-        Slicer(Gate()).feed(packets, np.arange(2) * 552_960)
+    lidar = sensors.lidar(sensors.FLOWN)
+    for packets in lidar.blanks():
+        Slicer(Gate(), lidar).feed(packets, np.arange(len(packets)) * STEP_NS)
     level = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
     zero = np.zeros((2, 3))
     flags = np.array([True, False])

@@ -11,15 +11,13 @@ import numpy as np
 from flightlog import nmea
 from flightlog.constants import HOUR_NS
 from flightlog.errors import LogError
-from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
 from groundproc.files import make_folder, written_aside
 from groundproc.flight import load, timebase
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors import identity as sensor_model
-from groundproc.sensors.hdl32e import Gate, Shots
+from groundproc.flight.lidar import lidar_of
+from groundproc.sensors.shots import Gate, Shots
 
 COLUMNS: Final = ("intensity", "return_number", "number_of_returns", "laser", "azimuth", "range")
 
@@ -49,38 +47,40 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
             (s.device_time_ns, fix) for s in load.position_samples(readers).sentences if (fix := nmea.parse_rmc(s.text))
         ]
         tie = timebase.lidar_utc(fixes)
-        about = "sensor frame, GPS time" if tie else "sensor frame, sensor time"
+        lidar = lidar_of(readers)
+        tied = tie is not None or not lidar.stamp_wraps
+        about = f"{lidar.name} frame, {'GPS' if tied else 'sensor'} time"
         origin_ns: int | None = None
+        offset_ns = 0
         with (
             written_aside(output) as aside,
-            CloudWriter(aside, COLUMNS, gps=tie is not None, about=about) as cloud,
+            CloudWriter(aside, COLUMNS, gps=tied, about=about) as cloud,
         ):
-            for batch in load.lidar_batches(readers, progress):
+            for batch in load.lidar_batches(readers, progress, lidar):
                 if not len(batch.packets):
                     continue
                 if origin_ns is None:
-                    sensor_model.refuse_other_models(batch.packets["data"], str(readers[0].path))
-                    origin_ns = int(batch.device_time_ns[0]) // HOUR_NS * HOUR_NS
-                for packets, time_ns in decode.by_mode(batch.packets, batch.device_time_ns):
-                    shots = decode.decode(packets, time_ns, gate)
-                    cloud.write(points_of(shots, origin_ns if tie is None else -tie.offset_ns))
+                    origin_ns = 0 if tied else int(batch.device_time_ns[0]) // HOUR_NS * HOUR_NS
+                    offset_ns = tie.offset_ns if tie else -origin_ns
+                for shots in lidar.decode(batch.packets, batch.device_time_ns, gate):
+                    cloud.write(points_of(shots, offset_ns))
             if origin_ns is None:
                 raise LogError(f"{readers[0].path}: no lidar packets in the log")
             if not cloud.points:
                 raise LogError(f"{readers[0].path}: no return within the field of view and the range gate")
-    return SensorCloud(cloud.points, "GPS time" if tie else "sensor time in seconds past the hour of the first packet")
+    return SensorCloud(cloud.points, "GPS time" if tied else "sensor time in seconds past the hour of the first packet")
 
 
-def points_of(shots: Shots, origin_ns: int) -> Points:
-    """Shots as points of the sensor's own frame, their times counted from an origin."""
-    # the last hundredth of a turn is rounded up to a whole one, which is 0
-    azimuth_cdeg = np.rint(shots.azimuth_cdeg) % 36_000
+def points_of(shots: Shots, offset_ns: int) -> Points:
+    """Shots as points of the sensor's own frame, an offset added to their times."""
+    azimuth_cdeg = np.rint(np.rad2deg(shots.azimuth_rad.astype(np.float64)) * 100.0)
     columns = {
         "intensity": shots.intensity,
         "return_number": shots.returns & 0x0F,
         "number_of_returns": shots.returns >> 4,
         "laser": shots.laser,
-        "azimuth": np.multiply(azimuth_cdeg, 0.01, dtype=np.float32),
-        "range": np.multiply(shots.range_steps, RANGE_LSB_M, dtype=np.float32),
+        # the last hundredth of a turn is rounded up to a whole one, which is 0
+        "azimuth": (azimuth_cdeg % 36_000 * 0.01).astype(np.float32),
+        "range": shots.range_m,
     }
-    return Points(shots.time_ns - origin_ns, shots.xyz_m.astype(np.float64), columns)
+    return Points(shots.time_ns + offset_ns, shots.xyz_m.astype(np.float64), columns)

@@ -15,7 +15,7 @@ from groundproc.estimation import ins
 from groundproc.flight.timeline import Leg
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.run import Run
-from groundproc.steps.step import Request, Step
+from groundproc.steps.step import WHOLE, Folders, Request, Step
 from groundproc.survey import ClockSettings, MountSettings, section
 
 FOUND: Final = f"{INSIDE}/clocks.json"
@@ -38,7 +38,7 @@ def check(request: Request) -> None:
         load_mount(request.survey.mount)
 
 
-def work(run: Run, folder: Path) -> None:
+def work(run: Run, folders: Folders) -> None:
     """Tie the clocks and say how well they fit."""
     flight, timeline = run.flight, run.timeline
     main = max(timeline, key=lambda leg: leg.sync.samples)
@@ -55,7 +55,7 @@ def work(run: Run, folder: Path) -> None:
             "unknown_frames": flight.unknown,
         },
     }
-    path = folder / FOUND
+    path = folders[WHOLE] / FOUND
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 

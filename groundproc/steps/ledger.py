@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -70,11 +70,6 @@ class Entry:
     finished: str
     seconds: float
 
-    def digest(self) -> str:
-        """One hash for all outputs."""
-        text = "".join(f"{name} {print_.digest}\n" for name, print_ in sorted(self.outputs.items()))
-        return hashlib.sha256(text.encode()).hexdigest()
-
 
 @dataclass(slots=True)
 class Ledger:
@@ -92,9 +87,9 @@ class Ledger:
     files : dict of str to Fingerprint
         Every file read, by absolute path.
     entries : dict of str to Entry
-        By step, finished.
+        By step, or part of one; finished.
     pending : dict of str to Entry
-        By step, finished, its outputs perhaps not all in their place yet.
+        By step, or part of one; finished, its outputs perhaps not all in their place yet.
     """
 
     folder: Path
@@ -113,6 +108,12 @@ class Ledger:
     def owned(self) -> dict[str, Fingerprint]:
         """All outputs by name."""
         return {name: mark for entry in self.entries.values() for name, mark in entry.outputs.items()}
+
+    def digest(self, units: Iterable[str]) -> str:
+        """One hash for all outputs of some finished steps."""
+        outputs = {name: mark.digest for unit in units for name, mark in self.entries[unit].outputs.items()}
+        text = "".join(f"{name} {digest}\n" for name, digest in sorted(outputs.items()))
+        return hashlib.sha256(text.encode()).hexdigest()
 
     def save(self) -> None:
         """Replace the file as a whole, on the disk before this returns."""
@@ -137,10 +138,10 @@ class Ledger:
         self.files[name] = fingerprint(path, self.files.get(name))
         return self.files[name]
 
-    def changed(self, step: str) -> dict[str, str]:
+    def changed(self, unit: str) -> dict[str, str]:
         """Outputs of a step that are not as they were made, by name: "is missing" or "was changed since"."""
         found = {}
-        for name, mark in self.entries[step].outputs.items():
+        for name, mark in self.entries[unit].outputs.items():
             path = self.folder / name
             if not path.is_file():
                 found[name] = "is missing"
@@ -149,21 +150,21 @@ class Ledger:
             if not now.same(mark):
                 found[name] = "was changed since"
             else:
-                self.entries[step].outputs[name] = now
+                self.entries[unit].outputs[name] = now
         return found
 
-    def commit(self, step: str, entry: Entry, staged: Path) -> None:
+    def commit(self, unit: str, entry: Entry, staged: Path) -> None:
         """Enter a finished step, and give its outputs, which lie in a folder of their own, their names.
 
         What the step made before and does not make any more goes.
         """
-        self.pending[step] = entry
+        self.pending[unit] = entry
         self.save()
-        self.settle(step, staged)
+        self.settle(unit, staged)
 
-    def settle(self, step: str, staged: Path) -> None:
+    def settle(self, unit: str, staged: Path) -> None:
         """Move what is pending into its place."""
-        entry = self.pending.pop(step)
+        entry = self.pending.pop(unit)
         whole = True
         for name, mark in entry.outputs.items():
             source, target = staged / name, self.folder / name
@@ -171,21 +172,28 @@ class Ledger:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 source.replace(target)
             whole &= target.is_file() and target.stat().st_size == mark.size
-        before = self.entries.pop(step, None)
+        before = self.entries.pop(unit, None)
         if whole:
             # renaming has changed what the file system says of them
             outputs = {name: replace(mark, seen=seen(self.folder / name)) for name, mark in entry.outputs.items()}
-            self.entries[step] = replace(entry, outputs=outputs)
+            self.entries[unit] = replace(entry, outputs=outputs)
         for name in set(before.outputs if before else ()) - set(entry.outputs):
             (self.folder / name).unlink(missing_ok=True)
         self.save()
-        shutil.rmtree(staged, ignore_errors=True)
+
+    def drop(self, unit: str) -> None:
+        """Remove what was made and is not asked for any more, but for files that somebody has changed."""
+        changed = self.changed(unit)
+        for name in self.entries.pop(unit).outputs:
+            if name not in changed:
+                (self.folder / name).unlink(missing_ok=True)
+        self.save()
 
     def forget_all(self) -> None:
         """Remove every output that is still as it was made, and the ledger."""
-        for step in self.entries:
-            changed = self.changed(step)
-            for name in self.entries[step].outputs:
+        for unit in self.entries:
+            changed = self.changed(unit)
+            for name in self.entries[unit].outputs:
                 if name not in changed:
                     (self.folder / name).unlink(missing_ok=True)
         shutil.rmtree(self.folder / INSIDE, ignore_errors=True)
@@ -261,6 +269,11 @@ def sweep(folder: Path) -> None:
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 path.unlink(missing_ok=True)
+
+
+def folder_of(part: str) -> str:
+    """Folder of a part within that of its step."""
+    return part or "whole"
 
 
 def staging(folder: Path, step: str) -> Path:

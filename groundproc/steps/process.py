@@ -5,7 +5,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -20,8 +20,10 @@ from groundproc.steps import ORDER
 from groundproc.steps.ledger import (
     INSIDE,
     Entry,
+    Fingerprint,
     Ledger,
     fingerprint,
+    folder_of,
     locked,
     open_ledger,
     staged_by_anyone,
@@ -30,17 +32,18 @@ from groundproc.steps.ledger import (
 )
 from groundproc.steps.run import Run
 from groundproc.steps.software import version
-from groundproc.steps.step import Key, Request, Step, absolute, steps
+from groundproc.steps.step import BETWEEN, WHOLE, Key, Request, Step, absolute, steps
 from groundproc.survey import FILES, Survey
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """How a step stands.
+    """How a step, or a part of one, stands.
 
     Attributes
     ----------
     step : str
+        Its name, with that of the part: "place: cloud.laz".
     about : str
     state : str
         "done", "stale" or "missing".
@@ -50,6 +53,7 @@ class State:
     finished : str
         UTC; empty where it never was.
     seconds : float
+        Time that it took, all parts that were made with it included.
     """
 
     step: str
@@ -97,8 +101,7 @@ def process(
         try:
             with Run(request, folder, progress) as run:
                 for step in steps()[: ORDER.index(until) + 1]:
-                    if force or reasons(step, request, ledger):
-                        _execute(step, run, ledger, force)
+                    _bring_up_to_date(step, run, ledger, force)
         except Exception:
             if was_empty:
                 ledger.forget_all()
@@ -109,26 +112,45 @@ def process(
         return states(request, ledger)
 
 
-def _execute(step: Step, run: Run, ledger: Ledger, force: bool) -> None:
-    """Do one step and enter it."""
+def _bring_up_to_date(step: Step, run: Run, ledger: Ledger, force: bool) -> None:
+    """Make the parts of a step that are not as they should be; what is not asked for any more goes."""
+    parts = step.parts(run.request)
+    due = [part for part in parts if force or reasons(step, part, run.request, ledger)]
+    if due:
+        _execute(step, due, run, ledger, force)
+    for unit in [unit for unit in ledger.entries if unit.partition(BETWEEN)[0] == step.name]:
+        if unit not in step.units(run.request):
+            ledger.drop(unit)
+
+
+def _execute(step: Step, parts: Sequence[str], run: Run, ledger: Ledger, force: bool) -> None:
+    """Make parts of a step and enter them."""
     staged = staging(ledger.folder, step.name)
+    folders = {part: staged / folder_of(part) for part in parts}
     began = time.monotonic()
     try:
-        staged.mkdir(parents=True)
-        key = key_of(step, run.request, ledger)
-        step.work(run, staged)
-        paths = sorted(path for path in staged.rglob("*") if path.is_file())
-        outputs = {path.relative_to(staged).as_posix(): fingerprint(path) for path in paths}
+        for place in folders.values():
+            place.mkdir(parents=True)
+        keys = {part: key_of(step, part, run.request, ledger) for part in parts}
+        step.work(run, folders)
+        outputs = {part: _fingerprints(place) for part, place in folders.items()}
         if not force:
-            _refuse_foreign(ledger, outputs)
-        entry = Entry(key, outputs, utc_text(time.time_ns()), time.monotonic() - began)
+            _refuse_foreign(ledger, [name for made in outputs.values() for name in made])
+        finished, seconds = utc_text(time.time_ns()), time.monotonic() - began
         with undisturbed():
-            ledger.commit(step.name, entry, staged)
+            for part, place in folders.items():
+                ledger.commit(step.unit(part), Entry(keys[part], outputs[part], finished, seconds), place)
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 
 
-def _refuse_foreign(ledger: Ledger, outputs: dict[str, Any]) -> None:
+def _fingerprints(folder: Path) -> dict[str, Fingerprint]:
+    """All files of a folder by their names in it."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): fingerprint(path) for path in paths}
+
+
+def _refuse_foreign(ledger: Ledger, outputs: Sequence[str]) -> None:
     """Refuse to write over files that no step made."""
     owned = ledger.owned()
     for name in outputs:
@@ -139,30 +161,32 @@ def _refuse_foreign(ledger: Ledger, outputs: dict[str, Any]) -> None:
 # What is to be done ---------------------------------------------------------------------------------------------------
 
 
-def key_of(step: Step, request: Request, ledger: Ledger) -> Key:
-    """What decides about the outcome of a step whose forerunners are done."""
+def key_of(step: Step, part: str, request: Request, ledger: Ledger) -> Key:
+    """What decides about the outcome of a part of a step whose forerunners are done."""
     files = step.files(request)
     # of a file the content counts, and not where it lies
     settings = {name: "a file" if name in files else value for name, value in step.settings(request).items()}
     return {
         "software": version(),
         "logs": sorted(ledger.fingerprint(log).digest for log in request.logs) if step.reads_logs else [],
-        "settings": settings,
+        "settings": settings | {"": step.parts(request)[part]},
         "files": {name: ledger.fingerprint(path).digest for name, path in files.items()},
-        "after": {name: ledger.entries[name].digest() for name in step.after},
+        "after": {other.name: ledger.digest(other.units(request)) for other in steps() if other.name in step.after},
     }
 
 
-def reasons(step: Step, request: Request, ledger: Ledger) -> list[str]:
-    """Why a step is to be done; empty where it need not be."""
-    entry = ledger.entries.get(step.name)
+def reasons(step: Step, part: str, request: Request, ledger: Ledger) -> list[str]:
+    """Why a part of a step is to be made; empty where it need not be."""
+    unit = step.unit(part)
+    entry = ledger.entries.get(unit)
     if entry is None:
         return ["not made yet"]
-    waits = [name for name in step.after if name not in ledger.entries]
+    forerunners = [unit for other in steps() if other.name in step.after for unit in other.units(request)]
+    waits = [unit for unit in forerunners if unit not in ledger.entries]
     if waits:
-        return [f"{name} is to be made first" for name in waits]
-    key, before = key_of(step, request, ledger), entry.key
-    found = [f"{name} {what}" for name, what in ledger.changed(step.name).items()]
+        return [f"{unit} is to be made first" for unit in waits]
+    key, before = key_of(step, part, request, ledger), entry.key
+    found = [f"{name} {what}" for name, what in ledger.changed(unit).items()]
     if key["software"] != before.get("software"):
         found.append(f"made by swath {before.get('software')}, this is {key['software']}")
     if key["logs"] != before.get("logs"):
@@ -174,9 +198,9 @@ def reasons(step: Step, request: Request, ledger: Ledger) -> list[str]:
 
 
 def _differences(before: Any, now: dict[str, Any]) -> list[str]:
-    """Settings that are not as they were, in words."""
+    """Settings that are not as they were, in words; the part's own are those without a name."""
     old = before if isinstance(before, dict) else {}
-    return [f"{name} was {old.get(name)!r}, is {now.get(name)!r}" for name in _changed_names(old, now)]
+    return [f"{name or 'options'} was {old.get(name)!r}, is {now.get(name)!r}" for name in _changed_names(old, now)]
 
 
 def _changed_names(before: Any, now: dict[str, Any]) -> list[str]:
@@ -186,22 +210,27 @@ def _changed_names(before: Any, now: dict[str, Any]) -> list[str]:
 
 
 def states(request: Request, ledger: Ledger) -> list[State]:
-    """How all steps stand; what comes after a step that is to be done waits for it."""
+    """How all steps stand, part by part; what comes after something that is to be made waits for it."""
     found: list[State] = []
-    open_steps: set[str] = set()
+    to_do: set[str] = set()
     for step in steps():
-        waits = [f"{name} comes first" for name in step.after if name in open_steps]
-        why = waits or reasons(step, request, ledger)
-        if why:
-            open_steps.add(step.name)
-        entry = ledger.entries.get(step.name)
-        if entry is None:
-            found.append(State(step.name, step.about, "missing", tuple(why)))
-            continue
-        outputs = tuple(name for name in entry.outputs if not name.startswith(INSIDE))
-        state = "stale" if why else "done"
-        found.append(State(step.name, step.about, state, tuple(why), outputs, entry.finished, entry.seconds))
+        waits = [f"{name} comes first" for name in step.after if name in to_do]
+        for part in step.parts(request):
+            why = waits or reasons(step, part, request, ledger)
+            if why:
+                to_do.add(step.name)
+            found.append(_state(step, part, why, ledger))
     return found
+
+
+def _state(step: Step, part: str, why: Sequence[str], ledger: Ledger) -> State:
+    unit = step.unit(part)
+    about = step.about if part == WHOLE else ""
+    entry = ledger.entries.get(unit)
+    if entry is None:
+        return State(unit, about, "missing", tuple(why))
+    outputs = tuple(name for name in entry.outputs if not name.startswith(INSIDE))
+    return State(unit, about, "stale" if why else "done", tuple(why), outputs, entry.finished, entry.seconds)
 
 
 # The folder -----------------------------------------------------------------------------------------------------------
@@ -226,8 +255,10 @@ def admitted(request: Request, folder: Path, force: bool) -> Ledger:
         if not force:
             _refuse_others(request, folder)
         ledger = Ledger(folder)
-    for step in list(ledger.pending):
-        ledger.settle(step, next(staged_by_anyone(folder, step), staging(folder, step)))
+    for unit in list(ledger.pending):
+        name, _, part = unit.partition(BETWEEN)
+        staged = next(staged_by_anyone(folder, name), staging(folder, name))
+        ledger.settle(unit, staged / folder_of(part))
     sweep(folder)
     if not force:
         _refuse_other_inputs(request, ledger)
@@ -272,8 +303,8 @@ def _refuse_other_inputs(request: Request, ledger: Ledger) -> None:
 
 def _refuse_changed(ledger: Ledger) -> None:
     """Refuse to write over products that somebody has changed."""
-    for step in ledger.entries:
-        for name, what in ledger.changed(step).items():
+    for unit in ledger.entries:
+        for name, what in ledger.changed(unit).items():
             if (ledger.folder / name).exists():
                 raise UsageError(f"{ledger.folder / name}: {what} it was made here; --force replaces it")
 

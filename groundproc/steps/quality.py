@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +11,7 @@ from flightlog.clock import utc_text
 from groundproc.estimation import ins
 from groundproc.steps import clocks, place
 from groundproc.steps.run import Run
-from groundproc.steps.step import Request, Step, absolute
+from groundproc.steps.step import WHOLE, Folders, Request, Step, absolute
 from groundproc.survey import SECTIONS, Survey, section
 from groundproc.trajectory.estimate import Estimate
 
@@ -22,12 +21,12 @@ def settings(request: Request) -> Mapping[str, Any]:
     return section(absolute(request.survey), *SECTIONS)
 
 
-def work(run: Run, folder: Path) -> None:
+def work(run: Run, folders: Folders) -> None:
     """Write quality.json."""
     tied = json.loads((run.folder / clocks.FOUND).read_text(encoding="utf-8"))
     placed = json.loads((run.folder / place.FOUND).read_text(encoding="utf-8"))
     quality = describe(run.survey, run.estimate, tied, placed)
-    (folder / "quality.json").write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
+    (folders[WHOLE] / "quality.json").write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
 
 
 def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from flightlog import config
 from groundproc.sensors.lasers import ESTIMATE
@@ -13,6 +13,14 @@ from groundproc.survey import FILES, Survey
 
 if TYPE_CHECKING:
     from groundproc.steps.run import Run
+
+WHOLE: Final = ""
+"""The part that is the step itself."""
+BETWEEN: Final = ": "
+"""In the ledger, between the name of a step and that of a part."""
+
+Folders = Mapping[str, Path]
+"""A folder for the outputs of each part, by its name."""
 
 Key = dict[str, Any]
 """What decides about a step's outcome, as plain values: a step whose key is as it was need not run again."""
@@ -56,9 +64,12 @@ class Step:
     files : callable
         Files beside the logs that it reads, by the name of the setting.
     work : callable
-        Writes the outputs into a folder that is given: all of its files are outputs, whatever their names.
+        Makes the parts that it is told to; each has a folder to write into: all of the files there are its outputs, whatever their names.
     check : callable
         Refuses what cannot be before any step begins.
+    parts : callable
+        What of it can be made alone, such as one of several products: settings of each that concern no other, by name. A step that is one
+        thing has one part without a name.
     """
 
     name: str
@@ -66,9 +77,18 @@ class Step:
     after: tuple[str, ...]
     reads_logs: bool
     settings: Callable[[Request], Mapping[str, Any]]
-    work: "Callable[[Run, Path], None]"
+    work: "Callable[[Run, Folders], None]"
     files: Callable[[Request], Mapping[str, Path]] = lambda request: {}
     check: Callable[[Request], None] = lambda request: None
+    parts: Callable[[Request], Mapping[str, Any]] = lambda request: {WHOLE: {}}
+
+    def unit(self, part: str) -> str:
+        """Name of a part in the ledger."""
+        return f"{self.name}{BETWEEN}{part}" if part else self.name
+
+    def units(self, request: Request) -> dict[str, Any]:
+        """Own settings of each part by its name in the ledger."""
+        return {self.unit(part): own for part, own in self.parts(request).items()}
 
 
 def steps() -> list[Step]:

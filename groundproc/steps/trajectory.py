@@ -12,7 +12,7 @@ from groundproc.estimation import methods
 from groundproc.estimation.method import chosen_corrections, gather
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.steps.run import Run
-from groundproc.steps.step import Request, Step
+from groundproc.steps.step import WHOLE, Folders, Request, Step
 from groundproc.survey import ClockSettings, MountSettings, PlacingSettings, Survey, TrajectorySettings, section
 from groundproc.trajectory.estimate import FILES, TRAJECTORY, Estimate, is_estimate, read_estimate, write_estimate
 from groundproc.trajectory.table import read_trajectory
@@ -60,9 +60,9 @@ def check(request: Request) -> None:
         raise UsageError("lasers: estimate given, but with a trajectory from elsewhere nothing is estimated")
 
 
-def work(run: Run, folder: Path) -> None:
+def work(run: Run, folders: Folders) -> None:
     """Estimate, and write the estimate's folder."""
-    write_estimate(folder, estimate(run))
+    write_estimate(folders[WHOLE], estimate(run))
 
 
 def estimate(run: Run) -> Estimate:

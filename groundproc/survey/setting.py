@@ -16,7 +16,7 @@ COMMAND: Final = "command"
 """Key of a `Command` in the metadata of a dataclass field."""
 
 
-WIDTH: Final = 116
+WIDTH: Final = 112
 """Of the comments in a sample file."""
 
 
@@ -102,6 +102,7 @@ def sample_lines(values: Any, field: "dataclasses.Field[Any]", notes: Sequence[s
     value = getattr(values, field.name)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield f"{field.name}:"
-        yield from (f"  {line}" for line in config.sample(type(value)).splitlines())
+        for nested in dataclasses.fields(value):
+            yield from (f"  {line}" for line in sample_lines(value, nested))
     else:
         yield f"{field.name}: {value_text(value)}"

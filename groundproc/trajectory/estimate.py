@@ -28,7 +28,6 @@ from flightlog.mount import Mount, load_mount
 from groundproc.files import written_aside
 from groundproc.flight.timeline import ClockTie
 from groundproc.geodesy import LocalFrame
-from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import LaserCorrections, read_lasers, write_lasers
 from groundproc.trajectory.covariance import SIZE, STATES, Correlation, correlation_of
 from groundproc.trajectory.table import read_trajectory, write_trajectory
@@ -113,11 +112,6 @@ class Estimate:
     figures: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
     method: str = ""
     note: str = ""
-
-    @property
-    def lasers(self) -> LaserTable:
-        """The lasers to place points with: the manual's table with the corrections."""
-        return self.corrections.table()
 
 
 @dataclass(frozen=True, slots=True)

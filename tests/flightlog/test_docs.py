@@ -23,7 +23,9 @@ def generate() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("page", ["log-format.md", "dimensions.md", "products.md", "methods/observations.md"])
+@pytest.mark.parametrize(
+    "page", ["log-format.md", "dimensions.md", "products.md", "survey.md", "methods/observations.md"]
+)
 def test_a_page_is_what_its_table_says_now(generate: ModuleType, page: str) -> None:
     assert (DOCS / page).read_text(encoding="utf-8") == generate.PAGES[page]()
 

@@ -87,7 +87,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
         trajectory,
         mount,
         begun.sigma_source if main.is_worse() else main.SIGMA_SOURCE,
-        main.lasers(given.corrections),
+        main.lasers(given.corrections, len(given.lidar.lasers)),
         mount_source=main.mount_source(given.mount_source),
         mount_sigma=main.mount_sigma(given.mount),
         report=main.report(given.mount),

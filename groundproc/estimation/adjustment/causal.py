@@ -57,8 +57,9 @@ class CausalRun:
     def corrections(self) -> None:
         """The lasers are taken as they are given."""
 
-    def lasers(self, nominal: LaserCorrections) -> LaserCorrections:
+    def lasers(self, nominal: LaserCorrections, count: int) -> LaserCorrections:
         """As they were given."""
+        del count
         return nominal
 
     def mount_source(self, nominal: str) -> str:

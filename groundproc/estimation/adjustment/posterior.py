@@ -62,11 +62,13 @@ class Spread:
         The first is known, the second is drawn: a difference, which by itself need be no covariance. The diagonal of their sum is
         `variance` where that of the second is positive.
         """
-        known = sum((_outer(of(column)) for column in self.columns), np.zeros_like(_outer(of(self.whole[0]))))
+        known = np.zeros_like(_outer(of(self.whole[0])))
+        for column in self.columns:
+            known += _outer(of(column))
         left = np.zeros_like(known)
         for whole, anchored in zip(self.whole, self.anchored, strict=True):
             left += _outer(of(whole)) - _outer(of(anchored))
-        return np.asarray(known), left / len(self.whole)
+        return known, left / len(self.whole)
 
     def without(self, unknowns: Sequence[slice]) -> "Spread":
         """The same as if some unknowns were known."""

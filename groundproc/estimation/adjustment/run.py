@@ -112,10 +112,10 @@ class Run:
         """Whether the mount is estimated: it is not without the autopilot's gyro, nor where what the run began from is used."""
         return "ins.turn" in self.windows[0].values and not self.is_worse()
 
-    def lasers(self, nominal: LaserCorrections) -> LaserCorrections:
-        """Corrections of the lasers as estimated, or as they were given."""
+    def lasers(self, nominal: LaserCorrections, count: int) -> LaserCorrections:
+        """Corrections of the sensor's lasers, so many, as estimated, or as they were given."""
         found = self.corrections()
-        return nominal if found is None or self.is_worse() else found.file()
+        return nominal if found is None or self.is_worse() else found.file(count)
 
     def trajectory(self, given: Given, mount: Mount) -> Trajectory:
         """The path as that of the ins frame, with the posterior's sigmas."""

@@ -22,7 +22,7 @@ from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
 from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.numerics import robust
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
 

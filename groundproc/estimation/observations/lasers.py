@@ -11,14 +11,15 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog.hdl32e import LASERS
 from groundproc.numerics.planerows import RowArrays, solved_plane
-from groundproc.sensors.hdl32e import LaserTable
 from groundproc.sensors.lasers import LaserCorrections
+from groundproc.sensors.shots import LaserTable
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+LASERS: Final = 32
+"""The most that are estimated; a sensor with fewer leaves the rest as they were, and one with more is refused before."""
 KINDS: Final = ("range", "elevation")
 """What is estimated of each laser; the unknowns stand in this order, 32 of each."""
 NAMES: Final = tuple(f"lasers.{kind}" for kind in KINDS)
@@ -106,13 +107,15 @@ class Corrections:
         first = KINDS.index(kind) * LASERS
         return slice(first, first + LASERS)
 
-    def file(self) -> LaserCorrections:
-        """What is worth keeping; the others stay as they were."""
+    def file(self, lasers: int = LASERS) -> LaserCorrections:
+        """What is worth keeping, of the sensor's number of lasers; the others stay as they were."""
         values = {}
         for kind, unit, scale in (("range", "m", 1.0), ("elevation", "deg", np.rad2deg(1.0))):
             value, sigma, found = self.of(kind)
             for name, numbers in ((f"{kind}_{unit}", value), (f"sigma_{kind}_{unit}", sigma)):
-                values[name] = tuple(round(float(number), 5) for number in np.where(found, scale * numbers, 0.0))
+                values[name] = tuple(
+                    round(float(number), 5) for number in np.where(found, scale * numbers, 0.0)[:lasers]
+                )
         return LaserCorrections(**values)
 
     def report(self) -> dict[str, Any]:
@@ -134,16 +137,16 @@ class Corrections:
     def figures(self, table: LaserTable) -> dict[str, npt.NDArray[Any]]:
         """The same as plain arrays for pictures, with the elevations of the table that the returns were placed with.
 
-        For each kind (`range`, `m`; `elevation`, `rad`): lasers.KIND_UNIT, KIND_sigma_UNIT, KIND_found (bool), shape (32,); and
-        KIND_mean_UNIT, shape (2,): the mean offset and its sigma. lasers.table_elevation_rad, shape (32,).
+        For each kind (`range`, `m`; `elevation`, `rad`): lasers.KIND_UNIT, KIND_sigma_UNIT, KIND_found (bool), shape (n,); and
+        KIND_mean_UNIT, shape (2,): the mean offset and its sigma. lasers.table_elevation_rad, shape (n,).
         """
         made: dict[str, npt.NDArray[Any]] = {"lasers.table_elevation_rad": table.elevation_rad}
         for kind, unit in (("range", "m"), ("elevation", "rad")):
             value, sigma, found = self.of(kind)
             made |= {
-                f"lasers.{kind}_{unit}": value,
-                f"lasers.{kind}_sigma_{unit}": sigma,
-                f"lasers.{kind}_found": found,
+                f"lasers.{kind}_{unit}": value[: len(table)],
+                f"lasers.{kind}_sigma_{unit}": sigma[: len(table)],
+                f"lasers.{kind}_found": found[: len(table)],
                 f"lasers.{kind}_mean_{unit}": np.array(self.mean(kind)),
             }
         return made

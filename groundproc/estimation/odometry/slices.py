@@ -12,14 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud import placing as cloud
 from groundproc.estimation.method import Given, Progress
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS
 from groundproc.estimation.odometry.spline import PathArrays
+from groundproc.flight.shots import shots as shots_of
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.voxelhash import spread, voxel_key
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 
 Array = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
@@ -71,7 +70,6 @@ def slices(given: Given, start_ns: int, progress: Progress, apart: bool = False)
     """
     survey = given.survey
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
-    tally = cloud.Tally()
     times: list[npt.NDArray[np.int64]] = []
     points: list[npt.NDArray[np.float32]] = []
     lines: list[npt.NDArray[np.uint8]] = []
@@ -80,8 +78,7 @@ def slices(given: Given, start_ns: int, progress: Progress, apart: bool = False)
     def told(done: int) -> None:
         progress("adjust", done)
 
-    for packets, utc_ns in cloud.chunks(given.readers, given.timeline, tally, told):
-        shots = decode.decode(packets, utc_ns, gate, given.lasers)
+    for shots in shots_of(given.readers, given.timeline, gate, given.lasers, progress=told):
         # at a change of leg the clock may step back by what the synchronisations differ by
         slot = (shots.time_ns - start_ns) // SLICE_NS
         edges = np.flatnonzero(np.diff(slot)) + 1

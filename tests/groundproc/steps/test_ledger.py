@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,7 @@ def committed(folder: Path, step: str, files: dict[str, str], ledger: Ledger | N
         (staged / name).write_text(text)
     outputs = {name: fingerprint(staged / name) for name in files}
     ledger.commit(step, Entry({"settings": {}}, outputs, "2026-05-20T10:00:00Z", 1.5), staged)
+    shutil.rmtree(staged)
     return ledger
 
 

@@ -1,5 +1,8 @@
 """Covariance of adjusted poses, against poses that are really moved and turned, and against samples of them."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,9 +12,11 @@ from flightlog.mount import Mount
 from groundproc.estimation.adjustment import windows
 from groundproc.estimation.adjustment.poses import pose_errors, semidefinite
 from groundproc.estimation.adjustment.posterior import Spread
+from groundproc.estimation.adjustment.run import Run
 from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
+from groundproc.geodesy import LocalFrame
 from tests.helpers.circling import INTERVALS, circle
 
 Array = npt.NDArray[np.float64]
@@ -135,3 +140,34 @@ def test_the_nearest_semidefinite_matrix_is_the_matrix_itself_where_it_is_one() 
     good = root @ np.swapaxes(root, 1, 2)
     np.testing.assert_allclose(semidefinite(good), good, atol=1e-12)
     np.testing.assert_allclose(semidefinite(-good), 0.0, atol=1e-12)
+
+
+def test_windows_that_are_joined_add_what_the_joining_does_not_know() -> None:
+    """Two windows of a flight: at each slice boundary the covariance is the sum of the window's and the joining's."""
+    rng = np.random.default_rng(4)
+    cut = 30
+
+    def errors(count: int) -> Any:
+        root = rng.normal(size=(count, 6, 8))
+        covariance = root @ np.swapaxes(root, 1, 2)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        return SimpleNamespace(
+            sigma_position_m=sigma[:, :3],
+            sigma_attitude_rad=sigma[:, 3:],
+            correlation=covariance / (sigma[:, :, None] * sigma[:, None, :]),
+            covariance=covariance,
+        )
+
+    first, second, joined = errors(cut + 11), errors(INTERVALS - cut + 1), errors(INTERVALS + 5)
+    first.own, second.own = cut, INTERVALS - cut
+    path = circle()
+    motion: Any = SimpleNamespace(start_ns=path.start_ns, known=np.ones(INTERVALS * STEPS, np.bool_))
+    unused: Any = None
+    run = Run([first, second], path, unused, motion, unused, joined)
+    given: Any = SimpleNamespace(frame=LocalFrame(58.4, 15.6, 60.0))
+    made = run.trajectory(given, Mount())
+    wanted = np.concatenate([first.covariance[:cut], second.covariance]) + joined.covariance[: INTERVALS + 1]
+    knots = made.time_ns[::STEPS]
+    np.testing.assert_allclose(made.covariance_at(knots), wanted, rtol=1e-9, atol=1e-9)
+    assert made.correlation is not None
+    np.testing.assert_array_equal(made.correlation.time_ns, knots)

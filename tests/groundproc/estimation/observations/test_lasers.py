@@ -16,6 +16,7 @@ from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.slices import Clusterer, Slice
 from groundproc.estimation.odometry.spline import Path
+from groundproc.sensors.hdl32e import LIDAR
 from groundproc.sensors.lasers import LaserCorrections, read_lasers, write_lasers
 
 Array = npt.NDArray[np.float64]
@@ -172,7 +173,7 @@ def test_a_file_is_read_as_it_was_written(tmp_path: File) -> None:
     write_lasers(path, made, "# of one sensor\n")
     assert path.read_text().startswith("# of one sensor\n")
     assert read_lasers(path) == made
-    table = read_lasers(path).table()
+    table = read_lasers(path).table(LIDAR.lasers)
     np.testing.assert_allclose(np.rad2deg(table.elevation_rad), np.array(ELEVATION_DEG) + made.elevation_deg)
     np.testing.assert_allclose(table.range_offset_m, made.range_m)
     for text, message in (
@@ -182,4 +183,4 @@ def test_a_file_is_read_as_it_was_written(tmp_path: File) -> None:
     ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=message):
-            read_lasers(path)
+            read_lasers(path).table(LIDAR.lasers, str(path))
