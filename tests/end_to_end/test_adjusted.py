@@ -57,7 +57,7 @@ def judged(folder: Path, survey: Survey, log: Path | None = None, *, cloud: bool
         given = gather([reader], read, timeline, truth.nominal_mount, survey)
         made = methods.estimate(given, lambda stage, size: None)
         placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
-        found = judge([reader] if cloud else [], truth, placed, made.mount, made.lasers)
+        found = judge([reader] if cloud else [], truth, placed, made.mount, made.corrections.table(read.lidar.lasers))
     return Judged(made, found.figures)
 
 
