@@ -160,7 +160,8 @@ def _method(name: str, truth: Truth, reader: LogReader) -> Made:
         raise SystemExit(f"{reader.path}: the lidar's clock was set in flight, expected one run of it")
     placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
     tie = tie_errors(timeline[0].sync, truth)
-    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning, estimate.report, tie)
+    lasers = estimate.corrections.table(flight.lidar.lasers)
+    return Made(placed, estimate.mount, lasers, True, *spent, estimate.warning, estimate.report, tie)
 
 
 def tie_errors(sync: Sync, truth: Truth) -> dict[str, float]:

@@ -65,7 +65,8 @@ def judged(folder: Path, survey: Survey, log: Path | None = None, *, cloud: bool
         given = gather([reader], read, timeline, truth.nominal_mount, survey)
         made = methods.estimate(given, lambda stage, size: None)
         placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
-        found = judge([reader] if cloud else [], truth, placed, made.mount, made.lasers)
+        lasers = made.corrections.table(read.lidar.lasers)
+        found = judge([reader] if cloud else [], truth, placed, made.mount, lasers)
     return Judged(made, found.figures, given.fixes[0].sigma_m.max(axis=0))
 
 

@@ -15,6 +15,7 @@ from groundproc.estimation import methods
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.flight.flight import Flight
 from groundproc.geodesy import LocalFrame
+from groundproc.sensors.hdl32e import LIDAR
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections
 from groundproc.survey import Survey
 from groundproc.survey.methods import METHODS
@@ -34,7 +35,7 @@ def trajectory() -> Trajectory:
 
 def given(survey: Survey) -> Given:
     """Nothing but a survey and where mount and lasers come from."""
-    return Given((), Flight([], []), (), (), (), LocalFrame(58.4, 15.6, 60.0), Mount(), survey, STATED, "log")
+    return Given((), Flight([], [], LIDAR), (), (), (), LocalFrame(58.4, 15.6, 60.0), Mount(), survey, STATED, "log")
 
 
 def quiet(stage: str, done: int) -> None:

@@ -70,10 +70,10 @@ def test_mount_and_lasers_are_those_that_the_trajectory_was_made_with(misled: bo
     given, nominal = LaserCorrections(), Mount()
     mount, sigma = run.mount(nominal), run.mount_sigma(nominal)
     if misled:
-        assert (mount, sigma, run.lasers(given), run.mount_source("log")) == (nominal, None, given, "log")
+        assert (mount, sigma, run.lasers(given, 32), run.mount_source("log")) == (nominal, None, given, "log")
         return
     assert run.mount_source("log") == "estimated by adjusted, begun from log"
-    assert run.lasers(given).range_m == (0.004,) * 32
+    assert run.lasers(given, 32).range_m == (0.004,) * 32
     turned = nominal.mat_ins_lidar().T @ mount.mat_ins_lidar()
     np.testing.assert_allclose(Rotation.from_matrix(turned).as_rotvec(), [-0.01, 0.0, -0.02], atol=1e-9)
     np.testing.assert_allclose(mount.lidar_position_m(), -mount.mat_ins_lidar() @ [0.0, 0.1, 0.16])
