@@ -100,7 +100,10 @@ def _place_each(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array, 
     covered = np.zeros(len(chosen), np.bool_)
     for start in range(0, len(chosen), _PIECE):
         some = chosen[start : start + _PIECE]
-        poses, covered[start : start + _PIECE] = sensor_poses(shots.time_ns[some], trajectory, mount)
+        poses, known = sensor_poses(shots.time_ns[some], trajectory, mount)
+        covered[start : start + _PIECE] = known
+        # poses outside the trajectory are no numbers to reckon with
+        some, poses = some[known], poses[known]
         mats = poses[:, :9].reshape(-1, 3, 3)
         xyz[some] = np.einsum("nij,nj->ni", mats, shots.xyz_m[some].astype(np.float64)) + poses[:, 9:]
     return covered

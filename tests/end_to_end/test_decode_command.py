@@ -75,7 +75,7 @@ def test_without_gps_times_are_the_sensors_own(
     np.testing.assert_allclose(np.asarray(cloud.gps_time), shots.time_ns * 1e-9, atol=1e-8)
     np.testing.assert_allclose(xyz(cloud), shots.xyz_m, atol=0.00051)
     assert (np.asarray(cloud["laser"]) == shots.laser).all()
-    away = (np.asarray(cloud["azimuth"]) - shots.azimuth_cdeg * 0.01 + 180.0) % 360.0 - 180.0
+    away = (np.asarray(cloud["azimuth"]) - np.rad2deg(shots.azimuth_rad) + 180.0) % 360.0 - 180.0
     assert np.abs(away).max() < 0.0051
     ranges = np.asarray(cloud["range"])
     assert 2.0 <= ranges.min() <= ranges.max() <= 40.0
