@@ -111,7 +111,18 @@ def ins_estimate(given: Given, progress: Progress) -> Estimate:
 
 
 def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
-    """Lidar, inertial sensors, GNSS and compass in one adjustment, begun from the autopilot's solution."""
+    """Lidar, inertial sensors, GNSS and compass in one adjustment, begun from the autopilot's solution.
+
+    Raises
+    ------
+    LogError
+        A lidar with so few lasers that it does not see a surface twice within a slice.
+    """
+    if len(given.lidar.lasers) < LEAST_LASERS:
+        raise LogError(
+            f"adjusted: a {given.lidar.name} has {len(given.lidar.lasers)} laser; at least {LEAST_LASERS} are needed to see "
+            "a surface again at once"
+        )
     return adjusted.estimate(given, progress, ins_estimate(given, progress).trajectory)
 
 
@@ -125,6 +136,9 @@ OPTIONS_OF: Final = {
     "control": ("adjusted",), "compass": ("dynamic",), "causal": ("adjusted",), "pose_grid_ms": ("ins",),
 }  # fmt: skip
 """Options of the survey that some methods alone look at."""
+
+LEAST_LASERS: Final = 8
+"""Of a lidar whose motion the adjustment can tell from its returns."""
 
 METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
     "ins": ins_estimate,
