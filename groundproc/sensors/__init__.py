@@ -12,6 +12,7 @@ from groundproc.sensors.model import Lidar
 MODELS: Final = {
     "HDL-32E": "groundproc.sensors.hdl32e",
     "VLP-16": "groundproc.sensors.vlp16",
+    "line scanner": "groundproc.sensors.linescan",
 }
 """Module of each model by its name; imported when asked for."""
 FLOWN: Final = "HDL-32E"

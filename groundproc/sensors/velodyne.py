@@ -100,6 +100,10 @@ class Velodyne:
         """See Lidar: product byte, and blocks as far apart as this model's."""
         data = data_of(packets)
         mine = self.valid(data)
+        if len(data) and hdl32e.is_hdl64e(data).any():
+            raise WrongSensorError(
+                f"{place}: blocks that start with FF DD are an {hdl32e.HDL_64E}'s; a {self.name} is needed"
+            )
         if len(data) and not mine.any():
             product = int(data["product"][0])
             name = f"a {_PRODUCTS[product]}" if product in _PRODUCTS else "an unknown sensor"

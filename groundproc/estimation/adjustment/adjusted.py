@@ -47,6 +47,9 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
 
+LEAST_LASERS: Final = 8
+"""Of a lidar whose motion the adjustment can tell from its returns."""
+
 
 def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observation] = ()) -> Estimate:
     """Adjust every run of the lidar's clock, begun from the autopilot's solution.
@@ -62,8 +65,14 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     Raises
     ------
     LogError
-        No run has lidar, inertial data and positions together.
+        No run has lidar, inertial data and positions together, or the lidar has so few lasers that it does not see a surface
+        twice within a slice.
     """
+    if len(given.lidar.lasers) < LEAST_LASERS:
+        raise LogError(
+            f"adjusted: a {given.lidar.name} has {len(given.lidar.lasers)} laser; at least {LEAST_LASERS} are needed to see "
+            "a surface again at once"
+        )
     begun = ins_estimate(given, progress)
     start = begun.trajectory
     made: list[Run | CausalRun] = []
