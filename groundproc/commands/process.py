@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from groundproc.steps.process import State
-    from groundproc.steps.step import Request
+    from groundproc.steps.request import Request
 
 HELP = "make a georeferenced cloud of a flight: cloud.laz, trajectory.csv, quality.json, pictures"
 
@@ -80,7 +80,7 @@ def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
     """What is asked for, and the folder of the products: from a folder's ledger where that is what is named."""
     from flightlog.errors import UsageError
     from groundproc.steps.process import remembered
-    from groundproc.steps.step import Request
+    from groundproc.steps.request import Request
     from groundproc.survey import Survey
 
     first: Path = arguments.logs[0]

@@ -14,8 +14,9 @@ from flightlog.mount import load_mount
 from groundproc.estimation import ins
 from groundproc.flight.timeline import Leg
 from groundproc.steps.ledger import INSIDE
+from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE, Folders, Request, Step
+from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import ClockSettings, MountSettings, section
 
 FOUND: Final = f"{INSIDE}/clocks.json"

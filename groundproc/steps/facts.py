@@ -11,8 +11,8 @@ from groundproc.estimation import ins
 from groundproc.estimation.method import Given, Progress, gather
 from groundproc.estimation.odometry.motion import base_motion
 from groundproc.flight.timeline import Leg
+from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import Request
 from groundproc.survey import Survey
 
 Notes = dict[str, list[str]]

@@ -19,8 +19,9 @@ from groundproc.products.product import Context, Making, streamed
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate
 from groundproc.steps.ledger import INSIDE
+from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE, Folders, Request, Step
+from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import PlacingSettings, Survey, section
 
 FOUND: Final = f"{INSIDE}/place.json"

@@ -30,9 +30,10 @@ from groundproc.steps.ledger import (
     staging,
     sweep,
 )
+from groundproc.steps.request import Request, absolute
 from groundproc.steps.run import Run
 from groundproc.steps.software import version
-from groundproc.steps.step import BETWEEN, WHOLE, Key, Request, Step, absolute, steps
+from groundproc.steps.step import BETWEEN, WHOLE, Key, Step, steps
 from groundproc.survey import FILES, Survey
 
 

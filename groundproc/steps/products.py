@@ -8,8 +8,9 @@ from typing import Any, Final
 from groundproc.products import chosen, plain
 from groundproc.products.product import Context, draw
 from groundproc.steps.place import projection_of
+from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import Folders, Request, Step
+from groundproc.steps.step import Folders, Step
 
 
 def settings(request: Request) -> Mapping[str, Any]:

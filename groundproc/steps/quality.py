@@ -10,8 +10,9 @@ from flightlog import FORMAT_VERSION, __version__, config
 from flightlog.clock import utc_text
 from groundproc.estimation import ins
 from groundproc.steps import clocks, place
+from groundproc.steps.request import Request, absolute
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE, Folders, Request, Step, absolute
+from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import SECTIONS, Survey, section
 from groundproc.trajectory.estimate import Estimate
 

@@ -16,7 +16,7 @@ from groundproc.estimation.method import Progress
 from groundproc.flight.flight import Flight, read_flight
 from groundproc.flight.mounting import find_mount
 from groundproc.flight.timeline import Leg, legs
-from groundproc.steps.step import Request
+from groundproc.steps.request import Request
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate, read_estimate
 

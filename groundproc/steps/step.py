@@ -1,18 +1,14 @@
 """What a step is: what it reads, the settings it looks at, what it makes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from flightlog import config
-from groundproc.sensors.lasers import ESTIMATE
 from groundproc.steps import ORDER
-from groundproc.survey import FILES, Survey
-
-if TYPE_CHECKING:
-    from groundproc.steps.run import Run
+from groundproc.steps.request import Request
+from groundproc.steps.run import Run
 
 WHOLE: Final = ""
 """The part that is the step itself."""
@@ -24,25 +20,6 @@ Folders = Mapping[str, Path]
 
 Key = dict[str, Any]
 """What decides about a step's outcome, as plain values: a step whose key is as it was need not run again."""
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What the user asks for.
-
-    Attributes
-    ----------
-    logs : sequence of Path
-        One or several logs of one flight.
-    survey : Survey
-        With the paths in it absolute or relative to the working directory.
-    poses : Path or None
-        A trajectory made before, to place the points with: an estimate's folder or a trajectory.csv.
-    """
-
-    logs: Sequence[Path]
-    survey: Survey
-    poses: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +71,3 @@ class Step:
 def steps() -> list[Step]:
     """All steps, in the order of the flight."""
     return [import_module(f"groundproc.steps.{name}").STEP for name in ORDER]
-
-
-def absolute(survey: Survey) -> Survey:
-    """A survey whose names of files hold from everywhere."""
-    tree = config.to_mapping(survey)
-    for name in FILES:
-        if isinstance(tree[name], str) and tree[name] != ESTIMATE:
-            tree[name] = str(Path(tree[name]).resolve())
-    if isinstance(tree["geoid"], str) and Path(tree["geoid"]).is_file():
-        tree["geoid"] = str(Path(tree["geoid"]).resolve())
-    return config.from_mapping(tree, Survey, "survey")

@@ -11,8 +11,9 @@ from flightlog.mount import Mount
 from groundproc.estimation import methods
 from groundproc.estimation.method import chosen_corrections, gather
 from groundproc.sensors.lasers import ESTIMATE
+from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE, Folders, Request, Step
+from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import ClockSettings, MountSettings, PlacingSettings, Survey, TrajectorySettings, section
 from groundproc.trajectory.estimate import FILES, TRAJECTORY, Estimate, is_estimate, read_estimate, write_estimate
 from groundproc.trajectory.table import read_trajectory

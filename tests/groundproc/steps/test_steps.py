@@ -120,7 +120,7 @@ def test_a_setting_concerns_the_steps_that_look_at_it(
 
 
 def test_the_window_concerns_the_trajectory_where_it_is_estimated_from_points() -> None:
-    from groundproc.steps.step import Request
+    from groundproc.steps.request import Request
     from groundproc.survey import Survey
 
     step = next(step for step in steps() if step.name == "trajectory")
@@ -135,7 +135,7 @@ def test_every_setting_is_looked_at_by_some_step() -> None:
     """By the figures, where they all stand, and by one that makes something."""
     import dataclasses
 
-    from groundproc.steps.step import Request
+    from groundproc.steps.request import Request
     from groundproc.survey import METHODS, Survey
 
     requests = [Request([], Survey(method=method, control="c.csv")) for method in METHODS]
