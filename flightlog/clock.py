@@ -1,4 +1,4 @@
-"""Time scales, as int nanoseconds: Unix time and GPS time, counters that wrap, the hour that a top-of-hour stamp belongs to."""
+"""Time scales, as int nanoseconds: Unix and GPS time, counters that wrap, the hour of a top-of-hour stamp."""
 
 from bisect import bisect_right
 from datetime import UTC, datetime

@@ -1,7 +1,8 @@
-"""MCAP records as bytes (mcap.dev/spec): what a reader needs of them, and how to tell a whole record from a damaged one. Pure.
+"""MCAP records as bytes (mcap.dev/spec): what a reader needs, and how to tell a whole record from a damaged one. Pure.
 
-Only chunks and attachments carry a checksum of their own. Everything else is held to its own lengths: a record whose parts do not
-add up to its size is damaged, so that one wrong bit in a length or an opcode cannot make a reader step over good chunks.
+Only chunks and attachments have a checksum of their own. All other records are checked by their lengths: a record
+whose parts do not add up to its size is damaged. One wrong bit in a length or an opcode therefore cannot make a
+reader skip good chunks.
 """
 
 import re

@@ -1,7 +1,7 @@
 """MAVLink 1 and 2: frames out of raw bytes, and messages of one kind as a numpy table.
 
-The dialect is pymavlink's `ardupilotmega`; framing is ours because a log holds bytes as they came, with their own receive times,
-and because frames whose checksum cannot be known must not pass for messages.
+The dialect is pymavlink's `ardupilotmega`. Framing is our own for two reasons: a log holds bytes as received, with
+their own receive times, and frames whose checksum cannot be verified must not pass for messages.
 """
 
 import re

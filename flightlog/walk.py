@@ -1,4 +1,4 @@
-"""A walk over the top level of an MCAP file, record by record, that steps over what is damaged and finds its way back."""
+"""Walks over the top level of an MCAP file, record by record, skips what is damaged, and finds the next good record."""
 
 import zlib
 from collections.abc import Iterator

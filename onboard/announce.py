@@ -1,4 +1,4 @@
-"""What the pilot's ground station is told: a text when something changes, and a few numbers. Pure: findings in, messages out."""
+"""What the pilot's ground station is told: a text when something changes, and a few numbers. Pure."""
 
 from collections import deque
 from collections.abc import Mapping

@@ -1,6 +1,6 @@
-"""MAVLink links, serial or UDP: bytes into the log exactly as received; listened to only to know that the autopilot lives.
+"""MAVLink links, serial or UDP: bytes are logged as received, and parsed only to see if the autopilot is alive.
 
-The link may come and go: it is opened again and again, and the rest of the daemon does not notice.
+The link may come and go: it is reopened as often as needed, and the rest of the daemon does not notice.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""An autopilot's boot time and UTC on log time, from what it sends: TIMESYNC where it speaks that, else its stamps and SYSTEM_TIME."""
+"""An autopilot's boot time and UTC on log time: from TIMESYNC if it speaks that, else its stamps and SYSTEM_TIME."""
 
 import struct
 from typing import Final

@@ -1,8 +1,9 @@
 """How the clocks of autopilot and lidar stand to log time. Pure: samples in, a line out.
 
-An autopilot that speaks TIMESYNC is asked: its answer lies between our question and its arrival, and the shortest round trips know
-best. Others only send their stamps. A stamp is never received before it was made, so the line that lies on top of all (stamp -
-receive time) is the best guess; the delay that every message has stays in it.
+An autopilot that speaks TIMESYNC is asked: its answer lies between our question and the arrival, and the shortest
+round trips are the most accurate. Other autopilots only send their stamps. No stamp can be received before it was
+made, so the best estimate is the upper envelope of (stamp - receive time). It still contains the delay that every
+message has.
 """
 
 from collections import deque

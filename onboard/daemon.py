@@ -1,4 +1,4 @@
-"""Start, run, stop. Signals set a flag; the watchdog is earned; whatever happens, the log is closed well."""
+"""Start, run, stop. Signals set a flag, the watchdog is fed only on progress, and the log is always closed."""
 
 import gc
 import logging

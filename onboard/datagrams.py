@@ -1,7 +1,7 @@
-"""UDP reception: many datagrams in one system call, each with the kernel's receive time; losses in the socket counted by it too.
+"""UDP reception: many datagrams in one system call, each with the kernel's receive time and its count of losses.
 
-recvmmsg(2) fills an array in place. What makes it cheap is the caller's habit of coming only every few milliseconds: a call that
-waits would wake up for each packet. Structures are those of a 64-bit Linux.
+recvmmsg(2) fills an array in place. It is cheap because the caller polls only every so many milliseconds: a call
+that waits would wake up for each packet. The structures are those of a 64-bit Linux.
 """
 
 import ctypes

@@ -1,4 +1,4 @@
-"""`swathd install` and `uninstall`: the service, its user, devices, network and sysctl files put in place, and taken away again."""
+"""`swathd install` and `uninstall`: the service, its user, devices, network and sysctl files."""
 
 import contextlib
 import subprocess

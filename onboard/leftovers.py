@@ -1,4 +1,4 @@
-"""Logs that a power cut or a crash left open: mended beside the recording, slowly, so that it is not disturbed."""
+"""Logs that a power cut or a crash left open: mended slowly while recording goes on, so that it is not disturbed."""
 
 import fcntl
 import logging

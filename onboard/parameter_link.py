@@ -1,4 +1,4 @@
-"""Parameters over MAVLink: read, set, and read back. A frame may be lost either way; nothing counts that was not confirmed."""
+"""Parameters over MAVLink: read, set, and read back. Frames may be lost both ways; only confirmed values count."""
 
 import functools
 import math

@@ -1,4 +1,4 @@
-"""What the receivers count, read once a second into what the status says: rates, ages, states."""
+"""The receivers' counters, read once a second and turned into the status: rates, ages, states."""
 
 import time
 from collections import deque

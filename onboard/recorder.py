@@ -1,7 +1,7 @@
-"""The flight log's writer: a bounded backlog that never makes a receiver wait, and segments synced to the disk twice a second.
+"""The flight log's writer: a bounded backlog on which no receiver waits, and segments synced to disk twice a second.
 
-It watches the space that is left. Below a floor the lidar is refused and the rest goes on; below a quarter of that the log is closed
-well and everything is refused, until there is room again.
+It watches the free space. Below a floor it refuses the lidar, and everything else goes on. Below a quarter of that
+floor it closes the log properly and refuses everything, until there is room again.
 """
 
 import errno

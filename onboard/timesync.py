@@ -1,7 +1,8 @@
-"""Log time: the wall clock at the start, carried on by the monotonic clock, so that it never steps inside a log.
+"""Log time: the wall clock at the start, continued by the monotonic clock, so that it never steps inside a log.
 
-The kernel stamps packets with the wall clock, which may be set while we record (no clock on the board, then GPS or NTP arrives).
-Each poll therefore notes how the wall clock stands to the monotonic one, and stamps are put on log time by that difference.
+The kernel stamps packets with the wall clock, which may be set during recording (no clock on the board, then GPS or
+NTP arrives). Each poll therefore notes the difference between wall clock and monotonic clock, and stamps are
+converted to log time with it.
 """
 
 import time

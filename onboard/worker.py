@@ -1,4 +1,4 @@
-"""A thread that must make progress: it says when it does, and its death is told."""
+"""A thread that must make progress: it reports progress, and its death is noticed."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""`swathd health`: what the status file says, judged. It is asked over SSH, so it loads nothing that takes time."""
+"""`swathd health`: the verdict on the status file. It is run over SSH, so it loads nothing that takes time."""
 
 import argparse
 import json
