@@ -22,6 +22,8 @@ LEAP_UNIX_S: Final = tuple(int(datetime.fromisoformat(day).replace(tzinfo=UTC).t
 """Unix seconds at which GPS time gained one more second on UTC (IERS Bulletin C; none announced since 2017)."""
 
 _U32: Final = 1 << 32
+_CALENDAR_NS: Final = (-62_135_596_800 * NS_PER_S, 253_402_300_799 * NS_PER_S)
+"""Years 1 to 9999."""
 _HOUR_NS: Final = 3600 * NS_PER_S
 
 
@@ -47,7 +49,9 @@ def gps_week_to_utc_ns(week: int, tow_ms: int) -> int:
 
 
 def utc_text(utc_ns: int) -> str:
-    """ISO 8601 text of a Unix time, to the millisecond."""
+    """ISO 8601 text of a Unix time, to the millisecond; one that no calendar has, beyond the year 9999, as seconds."""
+    if not _CALENDAR_NS[0] <= utc_ns <= _CALENDAR_NS[1]:
+        return f"{utc_ns / NS_PER_S:.3f} s after 1970"
     return datetime.fromtimestamp(utc_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 

@@ -9,7 +9,7 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 import yaml
 
@@ -18,8 +18,22 @@ from flightlog.errors import ConfigError
 T = TypeVar("T")
 
 
+LARGEST_BYTES: Final = 1 << 20
+"""Of a file."""
+_SHOWN: Final = 200
+"""Characters of a wrong value that an error repeats."""
+
+
 class _Loader(yaml.SafeLoader):
-    """YAML that refuses a key given twice, and leaves dates and times as the text they are."""
+    """YAML that refuses a key given twice and aliases, and leaves dates and times as the text they are."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):  # a few lines of aliases of aliases make gigabytes
+            raise yaml.composer.ComposerError(
+                problem="an alias (*) stands there, which is not taken; write the value out",
+                problem_mark=cast(Any, self).peek_event().start_mark,  # untyped in the stubs
+            )
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -75,11 +89,17 @@ def load(path: str | Path, cls: type[T]) -> T:
         The file cannot be read, is no YAML mapping, or holds an unknown key, a wrong type or a value out of range.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        with Path(path).open("rb") as file:
+            data = file.read(LARGEST_BYTES + 1)
+        text = data.decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not a text file") from None
+    except ValueError:
+        raise ConfigError(f"{str(path)!r}: is no name of a file") from None
+    if len(data) > LARGEST_BYTES:
+        raise ConfigError(f"{path}: is larger than {LARGEST_BYTES >> 10} KiB, which no configuration is")
     return loads(text, cls, str(path))
 
 
@@ -96,7 +116,7 @@ def loads(text: str, cls: type[T], place: str) -> T:
 def from_mapping(tree: Any, cls: type[T], place: str) -> T:
     """Build a dataclass from a parsed tree; `place` is the path so far. See `load`."""
     if not isinstance(tree, Mapping):
-        raise ConfigError(f"{place}: {tree!r} found, expected keys and values")
+        raise ConfigError(f"{place}: {_shown(tree)} found, expected keys and values")
     assert dataclasses.is_dataclass(cls)
     known = {field.name: field for field in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls)
@@ -133,7 +153,7 @@ def _convert(value: Any, hint: Any, rules: Mapping[str, Any], place: str) -> Any
 
 def _convert_tuple(value: Any, arms: tuple[Any, ...], rules: Mapping[str, Any], place: str) -> Any:
     if not isinstance(value, list):
-        raise ConfigError(f"{place}: {value!r} found, expected a list")
+        raise ConfigError(f"{place}: {_shown(value)} found, expected a list")
     if len(arms) == 2 and arms[1] is Ellipsis:
         arms = (arms[0],) * len(value)
     if len(value) != len(arms):
@@ -151,7 +171,13 @@ def _scalar(value: Any, hint: Any, place: str) -> Any:
         return float(value)
     if hint is Any or (isinstance(value, hint) and isinstance(value, bool) == (hint is bool)):
         return value
-    raise ConfigError(f"{place}: {value!r} found, expected {names.get(hint, hint.__name__)}")
+    raise ConfigError(f"{place}: {_shown(value)} found, expected {names.get(hint, hint.__name__)}")
+
+
+def _shown(value: Any) -> str:
+    """A wrong value as an error repeats it."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
 
 
 def _check(value: Any, rules: Mapping[str, Any], place: str) -> Any:

@@ -206,6 +206,8 @@ class LogReader:
         self._chunks: list[ChunkAt] = []
         self._topics: dict[int, str] = {}
         self._bad: set[int] = set()
+        self._opened: set[int] = set()
+        self._unpacked = 0
         try:
             self._file = self.path.open("rb")
         except OSError as error:
@@ -312,10 +314,20 @@ class LogReader:
 
     def _read_chunk(self, chunk: ChunkAt) -> bytes | None:
         try:
-            return container.open_chunk(self._read(chunk.offset + RECORD_HEAD.size, chunk.size - RECORD_HEAD.size))
+            content = container.open_chunk(self._read(chunk.offset + RECORD_HEAD.size, chunk.size - RECORD_HEAD.size))
+            self._weigh(chunk, len(content))
         except DAMAGE as error:
             self._note_bad(chunk, error)
             return None
+        return content
+
+    def _weigh(self, chunk: ChunkAt, size: int) -> None:
+        """Add up what the file unpacks to; RecordError beyond what any log of its size does."""
+        if chunk.offset not in self._opened:
+            self._opened.add(chunk.offset)
+            self._unpacked += size
+        if self._unpacked > _MOST_UNPACKED + _EXPANSION * self._size:
+            raise container.RecordError("the file unpacks to more than any log of its size")
 
     def _note_bad(self, chunk: ChunkAt, error: Exception) -> None:
         """Count a bad chunk, once however often it is read."""
@@ -337,8 +349,12 @@ class LogReader:
                     number, topic = container.channel(content[offset : offset + size])
                     self._topics[number] = topic
                     message = None
+                elif opcode == Opcode.MESSAGE:
+                    message = self._message(view[offset : offset + size])
+                elif opcode == Opcode.SCHEMA:
+                    message = None
                 else:
-                    message = self._message(view[offset : offset + size]) if opcode == Opcode.MESSAGE else None
+                    raise container.RecordError(f"a record of opcode {opcode} within a chunk")
             except DAMAGE as error:  # of a chunk without checksum
                 self._note_bad(chunk, error)
                 return
@@ -353,6 +369,9 @@ class LogReader:
         return None if topic is None else Message(topic, log_time_ns, content[_MESSAGE_HEAD.size :])
 
 
+_EXPANSION: Final = 32
+_MOST_UNPACKED: Final = 48 << 20
+"""A log unpacks to this many times its size and so many bytes; packed packets and telemetry are a third of their size at best."""
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 
 

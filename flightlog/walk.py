@@ -9,6 +9,9 @@ from flightlog import container
 from flightlog.container import DAMAGE, MAGIC, RECORD_HEAD, Opcode
 
 _WINDOW: Final = 1 << 20
+_SEARCHED: Final = 4
+"""Bytes that are unpacked in the search for good chunks, at most so many times those of the file: bytes that look like chunks
+within chunks within chunks would cost the square of their number."""
 _HEAD_BYTES: Final = RECORD_HEAD.size + container.CHUNK_HEAD_BYTES
 
 
@@ -61,6 +64,7 @@ class Walk:
             crc = self._crc(footer.summary_start, self._end + container.FOOTER_CHECKED_BYTES) if footer.crc else 0
             self._summary_good = crc == footer.crc
         self._in_summary = False
+        self._search_left = _SEARCHED * size + _WINDOW
 
     def __iter__(self) -> Iterator[Found]:
         offset = len(MAGIC)
@@ -139,8 +143,9 @@ class Walk:
 
     def _is_good_chunk(self, offset: int) -> bool:
         record = self._record(offset)
-        if record is None or not isinstance(record[1], ChunkAt):
+        if record is None or not isinstance(record[1], ChunkAt) or record[1].size > self._search_left:
             return False
+        self._search_left -= record[1].size
         with suppress(*DAMAGE):
             container.open_chunk(self._read(offset + RECORD_HEAD.size, record[1].size - RECORD_HEAD.size))
             return True

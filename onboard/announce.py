@@ -7,7 +7,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog.constants import NS_PER_S
-from onboard.health import LINK_SILENT_S, STALLED_NS, Level, LidarStatus, Status
+from onboard.health import LINK_SILENT_S, STALLED_NS, Level, LidarStatus, RecorderStatus, Status
 from onboard.lidarstate import State
 
 TEXT_BYTES: Final = 50
@@ -64,6 +64,15 @@ def _doing(lidar: LidarStatus) -> str:
     return "recording" if lidar.recording else "ready, not armed"
 
 
+def _disk(recorder: RecorderStatus) -> tuple[int, str]:
+    """Severity and words of the disk."""
+    if recorder.trouble:
+        return _SEVERITY[Level.CRITICAL], "disk trouble, see swathd health"
+    if recorder.space != "room":
+        return _SEVERITY[Level.CRITICAL], _SPACE[recorder.space]
+    return _SEVERITY[Level.GOOD], "disk good"
+
+
 def states(status: Status) -> dict[str, tuple[int, str]]:
     """What the pilot should know, by subject: severity and words without figures, so that they change with the state only."""
     lidar, recorder = status.lidar, status.recorder
@@ -73,7 +82,7 @@ def states(status: Status) -> dict[str, tuple[int, str]]:
         "lidar losses": (warning, "lidar packets lost")
         if lidar.kernel_drops + lidar.queue_drops
         else (good, "no losses"),
-        "disk": (good, "disk good") if recorder.space == "room" else (critical, _SPACE[recorder.space]),
+        "disk": _disk(recorder),
         "sync": (critical, "disk does not take the log")
         if recorder.sync_age_s > _SYNC_S
         else (good, "log reaches disk"),

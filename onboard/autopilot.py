@@ -15,7 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from flightlog import records
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import SourceError
-from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser, decode
+from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser
+from flightlog.vehicles import Sender, Vehicles
 from onboard.autopilotclock import AutopilotClock
 from onboard.config import LinkConfig, StreamsConfig
 from onboard.health import LOW_RATE
@@ -64,19 +65,44 @@ class LinkCounts:
     unknown_frames: int = 0
     messages: Counter[int] = field(default_factory=Counter)
     """Verified frames of the autopilot, by message id."""
-    autopilot: tuple[int, int] | None = None
-    """System and component of the first heartbeat of an autopilot."""
-    version: int = 1
-    """Of MAVLink, as the autopilot speaks it."""
-    heartbeats: int = 0
-    armed: bool | None = None
-    newest_ns: int = 0
-    """Log time of the autopilot's newest verified frame [ns]."""
+    vehicles: Vehicles = field(default_factory=Vehicles)
+    """Who speaks here, and which of them is the autopilot."""
     achieved_hz: dict[str, float] = field(default_factory=dict)
     """Of each message asked for, over the last seconds looked at [Hz]."""
     asked_hz: dict[str, int] = field(default_factory=dict)
     requests: int = 0
     """How many streams were asked for, or asked for again."""
+
+    @property
+    def autopilot(self) -> tuple[int, int] | None:
+        """System and component of the autopilot."""
+        return self.vehicles.autopilot
+
+    @property
+    def _sender(self) -> Sender:
+        return _NOBODY if self.vehicles.autopilot is None else self.vehicles.senders[self.vehicles.autopilot]
+
+    @property
+    def version(self) -> int:
+        """Of MAVLink, as the autopilot speaks it."""
+        return self._sender.version
+
+    @property
+    def heartbeats(self) -> int:
+        """Of the autopilot."""
+        return self._sender.heartbeats
+
+    @property
+    def newest_ns(self) -> int:
+        """Log time of the autopilot's newest verified frame [ns]; 0 before the first."""
+        return self._sender.newest_ns
+
+    def armed(self, log_ns: int) -> bool | None:
+        """Whether the aircraft is armed, as far as somebody heard lately says; None where nobody does."""
+        return self.vehicles.armed(log_ns)
+
+
+_NOBODY: Final = Sender(0)
 
 
 class Link(Worker):
@@ -226,26 +252,21 @@ def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
         if not frame.known:
             continue
         counts.frames += 1
-        if frame.message_id == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            _note_heartbeat(counts, frame)
+        if counts.vehicles.hear(frame):
+            _tell_autopilot(counts)
         if (frame.system, frame.component) == counts.autopilot:
             counts.messages[frame.message_id] += 1
-            counts.newest_ns = frame.time_ns
 
 
-def _note_heartbeat(counts: LinkCounts, frame: Frame) -> None:
-    """The autopilot is the first that says it is one; others on the link (gimbals, ground stations) are not."""
-    heartbeat = decode(frame)
-    if heartbeat is None or heartbeat.autopilot == AUTOPILOT_INVALID:
-        return
-    sender = (frame.system, frame.component)
+def _tell_autopilot(counts: LinkCounts) -> None:
+    """Say who the autopilot is, and who else might be."""
+    first, *others = (f"{system}/{component}" for system, component in counts.vehicles.vehicles())
     if counts.autopilot is None:
-        counts.autopilot = sender
-        _log.info("autopilot %d/%d heard, MAVLink %d", *sender, frame.version)
-    if sender == counts.autopilot:
-        counts.heartbeats += 1
-        counts.version = frame.version
-        counts.armed = bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+        _log.warning("nobody on the link is an autopilot any more")
+    elif others:
+        _log.warning("autopilot %s heard, MAVLink %d; other vehicles: %s", first, counts.version, ", ".join(others))
+    else:
+        _log.info("autopilot %s heard, MAVLink %d", first, counts.version)
 
 
 class Requester:

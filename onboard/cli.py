@@ -6,7 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flightlog.errors import SwathError
+from flightlog.errors import SwathError, UsageError
+from flightlog.words import clean
 from onboard.commands import check, gate, health, install, lidar, parameters, uninstall
 
 
@@ -16,14 +17,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return int(options.command(options))
     except SwathError as error:
-        print(f"swathd: {error}", file=sys.stderr)
+        print(f"swathd: {clean(str(error))}", file=sys.stderr)
         return error.exit_code
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swathd", description="Records the lidar and the autopilot to a flight log.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    parser.set_defaults(command=lambda _: _help(parser))
+    commands = parser.add_subparsers(metavar="COMMAND")
 
     run = commands.add_parser("run", help="record until told to stop")
     _add_config(run)
@@ -38,6 +40,12 @@ def _parser() -> argparse.ArgumentParser:
         command.add_arguments(child)
         child.set_defaults(command=command.run)
     return parser
+
+
+def _help(parser: argparse.ArgumentParser) -> int:
+    """What `swathd` alone says."""
+    parser.print_help(sys.stderr)
+    return UsageError.exit_code
 
 
 class _Version(argparse.Action):

@@ -106,6 +106,9 @@ class RecorderConfig:
     """Where flight logs go and how often they are made safe."""
 
     directory: str = option("/var/lib/swathd", "folder of the flight logs; made if it is not there")
+    folders: tuple[str, ...] = option(
+        (), "further folders, tried in turn where that one cannot be written to; on another card or disk"
+    )
     lidar: str = option(
         "always", "when to record the lidar; armed: while the autopilot says so, or cannot be heard; all else always",
         choices=("always", "armed"),

@@ -50,6 +50,35 @@ _END_S: Final = 60.0
 """How long a worker may take to end: a slow disk gets the time to take what is in the backlog."""
 
 
+class Landing:
+    """Tells a landing from an autopilot, or a stranger, that flips between armed and disarmed.
+
+    Landed is who stays disarmed for `DISARMED_S`; and nobody lands again within `APART_S`.
+    """
+
+    DISARMED_S: Final = 5.0
+    APART_S: Final = 30.0
+
+    def __init__(self) -> None:
+        self._was_armed = False
+        self._since_ns: int | None = None
+        self._landed_ns: int | None = None
+
+    def look(self, is_armed: bool | None, now_ns: int) -> bool:
+        """Take what is known now, None where nothing is; whether the aircraft has just landed."""
+        if is_armed is not False:
+            self._was_armed |= bool(is_armed)
+            self._since_ns = None
+            return False
+        self._since_ns = now_ns if self._since_ns is None else self._since_ns
+        if not self._was_armed or now_ns - self._since_ns < self.DISARMED_S * NS_PER_S:
+            return False
+        if self._landed_ns is not None and now_ns - self._landed_ns < self.APART_S * NS_PER_S:
+            return False
+        self._was_armed, self._landed_ns = False, now_ns
+        return True
+
+
 class Daemon:
     """The running whole.
 
@@ -78,7 +107,7 @@ class Daemon:
         self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
         self._stop = stop
         self._status_trouble = False
-        self._was_armed = False
+        self._landing = Landing()
         self._links: dict[str, Link] = {}
         self._relay: Relay | None = None
 
@@ -92,7 +121,9 @@ class Daemon:
         try:
             keep_free_bytes = 2 * settings.recorder.min_free_mb << 20
             self._salvager = leftovers.begin(self._directory, keep_free_bytes, settings.recorder.compression)
-            self._recorder = Recorder(settings.recorder, lambda: self._open_segment(settings, mount))
+            self._recorder = Recorder(
+                settings.recorder, lambda directory: self._open_segment(directory, settings, mount)
+            )
         except BaseException:
             self._lidar.close()
             raise
@@ -104,8 +135,8 @@ class Daemon:
         self._announcer, self._endurance = Announcer(), Endurance()
         self._keep_free_bytes = settings.recorder.min_free_mb << 20
 
-    def _open_segment(self, settings: SwathdConfig, mount: Mount) -> Segment:
-        path = logfolder.next_segment_path(self._directory, self._boot_id)
+    def _open_segment(self, directory: Path, settings: SwathdConfig, mount: Mount) -> Segment:
+        path = logfolder.next_segment_path(directory, self._boot_id)
         now = read_clocks()
         boottime_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         clock = HostClock(self._log_time.at(now), now.realtime_ns, now.monotonic_ns, boottime_ns)
@@ -221,10 +252,8 @@ class Daemon:
     def _note_landing(self, is_armed: bool | None) -> None:
         """A flight ends with its disarming: its segment is closed then, so that it can be pulled."""
         assert self._recorder is not None
-        if is_armed is False and self._was_armed:
+        if self._landing.look(is_armed, time.monotonic_ns()):
             self._recorder.rotate()
-        if is_armed is not None:
-            self._was_armed = is_armed
 
     def _clock_syncs(self, clock: HostClock) -> list[ClockSync]:
         """How the devices' clocks stand to log time, also for the log."""
@@ -299,7 +328,10 @@ class Daemon:
         assert self._recorder is not None
         counts, backlog = self._recorder.counts, self._recorder.backlog
         leftover = self._salvager.counts
-        free_bytes = logfolder.free_bytes(self._directory)
+        try:
+            free_bytes = logfolder.free_bytes(Path(counts.directory or self._directory))
+        except OSError:  # the folder is gone; the recorder says so
+            free_bytes = 0
         return RecorderStatus(
             segment=counts.segment,
             messages=counts.messages,
@@ -314,6 +346,8 @@ class Daemon:
             space=counts.space.value,
             refused_for_space=counts.refused_for_space,
             lost_on_disk=counts.lost_on_disk,
+            trouble=counts.trouble,
+            abandoned=counts.abandoned,
             leftovers=leftover.found,
             leftovers_mended=leftover.mended,
             leftovers_left=leftover.left,
@@ -335,4 +369,7 @@ def run(settings: SwathdConfig, config_path: Path) -> None:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
+    signal.signal(
+        signal.SIGHUP, signal.SIG_IGN
+    )  # nothing can be read anew in flight, and a terminal that closes ends no recording
     Daemon(settings, config_path, stop).run()

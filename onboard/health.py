@@ -77,6 +77,8 @@ class LinkStatus:
     version: int = 0
     heartbeats: int = 0
     armed: bool | None = None
+    vehicles: list[str] = field(default_factory=list)
+    """All on the link that may be autopilots, the one that is believed first."""
     bad_bytes: int = 0
     unknown_frames: int = 0
     dropped_bytes: int = 0
@@ -109,6 +111,10 @@ class RecorderStatus:
     """Messages."""
     lost_on_disk: int = 0
     """Messages."""
+    trouble: str = ""
+    """Why nothing is recorded, or where it is recorded instead."""
+    abandoned: int = 0
+    """Segments that were deleted while they were written, or on a disk that failed."""
     leftovers: int = 0
     """Logs that a power cut or a crash had left open, found at the start."""
     leftovers_mended: int = 0
@@ -272,7 +278,11 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
         return [(Level.WARNING, f"link {name}: open, but no autopilot heard")]
     if link.age_s > LINK_SILENT_S:
         return [(Level.WARNING, f"link {name}: autopilot silent for {link.age_s:.0f} s")]
-    found = [
+    found = []
+    if len(link.vehicles) > 1:
+        others = ", ".join(link.vehicles[1:])
+        found.append((Level.WARNING, f"link {name}: {link.autopilot} is taken for the autopilot; also heard: {others}"))
+    found += [
         (
             Level.WARNING,
             f"link {name}: {message} at {hz:.1f} Hz of {link.asked_hz[message]} asked for; is its rate set elsewhere?",
@@ -288,18 +298,27 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
 
 
 _SPACE: Final = {
-    "low": "space is low, so the lidar is not recorded; pull the logs, or delete what is not needed",
-    "full": "the disk is full and nothing is recorded; pull the logs, or delete what is not needed",
+    "low": "space is low, so the lidar is not recorded; pull the logs, or delete closed ones, which are read-only",
+    "full": "the disk is full and nothing is recorded; pull the logs, or delete closed ones, which are read-only",
 }
 
 
 def _judge_recorder(recorder: RecorderStatus) -> list[tuple[Level, str]]:
+    if recorder.trouble:
+        return [(Level.CRITICAL, f"recorder: {recorder.trouble}")]
     if recorder.space in _SPACE:
         return [(Level.CRITICAL, f"recorder: {_SPACE[recorder.space]}")]
     if recorder.sync_age_s > STALLED_NS / NS_PER_S:
         return [(Level.CRITICAL, f"recorder: nothing reached the disk for {recorder.sync_age_s:.0f} s")]
     if recorder.lost_on_disk:
         return [(Level.WARNING, f"recorder: {recorder.lost_on_disk} messages lost on a full disk")]
+    if recorder.abandoned:
+        return [
+            (
+                Level.WARNING,
+                f"recorder: {recorder.abandoned} segments were deleted while they were written, or their disk failed; see the journal",
+            )
+        ]
     if recorder.leftovers_left:
         return [
             (Level.WARNING, f"recorder: {recorder.leftovers_left} earlier logs cut off and not mended; see the journal")

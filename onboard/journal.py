@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
+from flightlog.words import clean, clean_lines
+
 try:
     from systemd.journal import send as _send
 except ImportError:
@@ -23,6 +25,8 @@ _PRIORITIES: Final = (
     (logging.INFO, 6),
 )
 _DEBUG: Final = 7
+_MOST_LINES: Final = 200
+"""Of a record, a traceback with it."""
 
 
 def event(name: str, **fields: object) -> dict[str, Any]:
@@ -56,10 +60,10 @@ class JournalHandler(logging.Handler):
         """Send one record; a journal that is away must not hold the daemon up, so standard error gets it instead."""
         assert _send is not None
         try:
-            text = self.format(record)
+            text = "\n".join(clean_lines(self.format(record), _MOST_LINES))
             _send(text, **fields(record))
         except OSError:
-            sys.stderr.write(f"<{priority(record.levelno)}>{record.getMessage()}\n")
+            sys.stderr.write(f"<{priority(record.levelno)}>{clean(record.getMessage())}\n")
         except Exception:  # as every logging handler: what is wrong with a record must not end who logs it
             self.handleError(record)
 
@@ -70,7 +74,15 @@ class PriorityFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Format one record."""
         prefix = f"<{priority(record.levelno)}>"
-        return "\n".join(prefix + line for line in super().format(record).splitlines())
+        return "\n".join(prefix + line for line in clean_lines(super().format(record), _MOST_LINES))
+
+
+class PlainFormatter(logging.Formatter):
+    """Lines for a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Format one record."""
+        return "\n".join(clean_lines(super().format(record), _MOST_LINES))
 
 
 def in_journal() -> bool:
@@ -88,7 +100,7 @@ def start(level: int = logging.INFO) -> None:
     handler: logging.Handler
     if not in_journal():
         handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handler.setFormatter(PlainFormatter("%(asctime)s %(levelname)s %(message)s"))
     elif _send is not None and Path("/run/systemd/journal/socket").exists():
         handler = JournalHandler()
         handler.setFormatter(logging.Formatter("%(message)s"))

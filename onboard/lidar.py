@@ -15,6 +15,7 @@ import numpy.typing as npt
 from flightlog import hdl32e, records
 from flightlog.constants import HOUR_NS, NS_PER_S, NS_PER_US
 from flightlog.records import SCAN_PACKET_DTYPE, LidarAccount
+from flightlog.words import clean_bytes
 from onboard import fovmask, lidarstate
 from onboard.batch import BATCH_NS, Batch
 from onboard.clocksync import Envelope
@@ -440,7 +441,7 @@ class LidarPort(Worker):
             return
         stamp_ns = int(kept_ns[-1])
         self.counts.pps = int(kept["pps"][-1])
-        self.counts.nmea = kept["nmea"][-1].split(b"\0")[0].decode("ascii", "replace").strip()
+        self.counts.nmea = clean_bytes(bytes(kept["nmea"][-1]))
         self.counts.position_ns = stamp_ns
         if not self._wanted():
             return

@@ -52,7 +52,7 @@ REMEDY: Final = {
     State.SILENT: "the network link is not down; check its power and its laser switch",
     State.WRONG_MODEL: "an HDL-32E is needed",
     State.WRONG_LENGTH: "does something else send to its port?",
-    State.WRONG_SENDER: "lidar.sensor of the configuration names one that is silent",
+    State.WRONG_SENDER: "the one taken for the lidar, or named by lidar.sensor, is silent, and another one sends",
     State.WRONG_CONTENT: "packets of no Velodyne arrive; does something else send to its port?",
     State.RATE_LOW: "check cable, network load and receive buffer",
 }

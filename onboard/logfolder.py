@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -19,7 +19,8 @@ _log = logging.getLogger(__name__)
 MANIFEST: Final = "manifest.jsonl"
 ACKNOWLEDGED: Final = "acknowledged.jsonl"
 READ_ONLY: Final = 0o444
-_NAME: Final = re.compile(r"(\d{5})-(\d{3})\.mcap")
+_NAME: Final = re.compile(r"(\d{5,})-(\d{3,})\.mcap")
+"""Boot and segment; both have as many digits as it takes."""
 _RESERVE: Final = ".reserve"
 _RESERVE_BYTES: Final = 4 << 20
 _READ_BYTES: Final = 1 << 20
@@ -42,7 +43,7 @@ def next_segment_path(directory: Path, boot_id: str) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in directory.iterdir()} | set(read_manifest(directory))
-        taken = [(int(match[1]), int(match[2])) for name in names if (match := _NAME.match(name))]
+        taken = [numbers for name in names if (numbers := _numbers(name)) is not None]
         last_id, last = _last_boot(state)
         newest = max([last, *(boot for boot, _ in taken)])
         boot = last if boot_id == last_id and last == newest else newest + 1
@@ -52,6 +53,17 @@ def next_segment_path(directory: Path, boot_id: str) -> Path:
         raise LogError(f"{directory}: logs cannot be written there ({error.strerror})") from error
     segment = 1 + max((number for of_boot, number in taken if of_boot == boot), default=-1)
     return directory / f"{boot:05d}-{segment:03d}.mcap"
+
+
+def _numbers(name: str) -> tuple[int, int] | None:
+    """Boot and segment in a file's name, that of a damaged original too; None for other files."""
+    match = _NAME.match(name)
+    return None if match is None else (int(match[1]), int(match[2]))
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names of segments in the order of their numbers, and others behind them: as texts, 1000 would come before 999."""
+    return sorted(names, key=lambda name: (_numbers(name) is None, _numbers(name) or (0, 0), name))
 
 
 def _last_boot(state: Path) -> tuple[str, int]:
@@ -162,7 +174,8 @@ def sha256(path: Path, progress: Callable[[int], None] | None = None) -> str:
 def leftovers(directory: Path) -> list[Path]:
     """Segments that are in no manifest: who wrote them was cut off."""
     known = read_manifest(directory)
-    return sorted(path for path in directory.glob("*.mcap") if _NAME.fullmatch(path.name) and path.name not in known)
+    names = (path.name for path in directory.glob("*.mcap") if _NAME.fullmatch(path.name) and path.name not in known)
+    return [directory / name for name in in_order(names)]
 
 
 # Space ----------------------------------------------------------------------------------------------------------------
@@ -214,7 +227,9 @@ def prune(directory: Path, enough: Callable[[], bool]) -> list[str]:
     """
     safe = acknowledged(directory)
     gone = []
-    for name, line in sorted(read_manifest(directory).items()):
+    lines = read_manifest(directory)
+    for name in in_order(lines):
+        line = lines[name]
         if enough():
             break
         path = directory / Path(name).name

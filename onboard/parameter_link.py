@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 import select
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,6 +27,11 @@ _HEARTBEAT_S: Final = 5.0
 _HEARTBEAT_FRESH_NS: Final = 3 * NS_PER_S
 _TICK_S: Final = 0.01
 _BURST: Final = 5
+_MOST: Final = 5000
+"""Parameters of an autopilot: ArduPilot has 1,400."""
+_IN_VAIN: Final = 6
+"""Bursts without any answer, after which no more are sent."""
+_PARAMETER_NAME: Final = re.compile(r"[A-Za-z0-9_]+")
 """Requests on their way at a time: the autopilot's queue for incoming bytes is short."""
 _INTEGERS: Final = {
     dialect.MAV_PARAM_TYPE_UINT8: (0, 2**8 - 1),
@@ -56,6 +62,8 @@ class ParameterCounts:
 
     sent: int = 0
     repeated: int = 0
+    bad_names: int = 0
+    """Parameters left out because their names are none."""
 
 
 class ParameterLink:
@@ -76,6 +84,8 @@ class ParameterLink:
         self.counts = ParameterCounts()
         self.values: dict[str, Value] = {}
         """All that was heard, by name."""
+        self._nameless: set[int] = set()
+        """Numbers of those whose name is none."""
         self._device = config.device
         self._log_time = LogTime.start(read_clocks())
         self._source: Source = open_source(config, self._log_time)
@@ -150,24 +160,39 @@ class ParameterLink:
             if not (missing := self._missing()):
                 break
             self.counts.repeated += len(missing)
-            for start in range(0, len(missing), _BURST):
-                part = missing[start : start + _BURST]
-                for index in part:
-                    self._send(self._mavlink.param_request_read_encode(system, component, b"", index))
-                self._until(functools.partial(self._have, part), _WAIT_S)
+            if not self._ask_again(missing, system, component):
+                break
         if not self.values or self._missing():
             lost = len(self._missing()) if self.values else "all"
             raise SourceError(f"{self._device}: {lost} parameters did not come in {_TRIES} tries")
         return {name: value.value for name, value in sorted(self.values.items())}
+
+    def _ask_again(self, missing: Sequence[int], system: int, component: int) -> bool:
+        """Ask for parameters by their numbers; False, soon, where nobody answers."""
+        in_vain = 0
+        for start in range(0, len(missing), _BURST):
+            part = missing[start : start + _BURST]
+            for index in part:
+                self._send(self._mavlink.param_request_read_encode(system, component, b"", index))
+            before = len(self.values)
+            self._until(functools.partial(self._have, part), _WAIT_S)
+            in_vain = 0 if len(self.values) > before else in_vain + 1
+            if in_vain == _IN_VAIN:
+                return False
+        return True
 
     def _have(self, part: Sequence[int]) -> bool:
         """Whether none of these parameters is missing."""
         return not set(part) & set(self._missing())
 
     def _missing(self) -> list[int]:
-        """Numbers of the parameters that have not come; [0] if none has."""
+        """Numbers of the parameters that have not come; [0] if none has. SourceError if they are more than any autopilot has."""
         count = max((value.count for value in self.values.values()), default=1)
-        return sorted(set(range(count)) - {value.index for value in self.values.values()})
+        if count > _MOST:
+            raise SourceError(
+                f"{self._device}: the autopilot says that it has {count} parameters, expected {_MOST} at most"
+            )
+        return sorted(set(range(count)) - {value.index for value in self.values.values()} - self._nameless)
 
     def _while_they_come(self) -> None:
         before = -1
@@ -214,7 +239,7 @@ class ParameterLink:
                 raise UsageError(
                     f"{self._device}: the autopilot is not heard any more; parameters are set only while it is"
                 )
-        if self._life.armed:
+        if self._life.armed(self._log_time.at(read_clocks())) is not False:
             raise UsageError(f"{self._device}: the autopilot is armed; parameters are set only while it is disarmed")
 
     def _set(self, name: str, value: float) -> None:
@@ -267,6 +292,10 @@ class ParameterLink:
     def _note(self, message: dialect.MAVLink_message | None) -> None:
         if message is not None and math.isfinite(message.param_value):
             name = message.param_id[:NAME_BYTES]
+            if _PARAMETER_NAME.fullmatch(name) is None:  # it would be a line of a file, and words on a terminal
+                self._nameless.add(message.param_index)
+                self.counts.bad_names = len(self._nameless)
+                return
             self.values[name] = Value(message.param_value, message.param_type, message.param_index, message.param_count)
 
 

@@ -25,9 +25,6 @@ _PAUSE_S: Final = 0.5
 _ENDURANCE_S: Final = 10.0
 """Over less than this the log's growth is not told from its bursts."""
 
-_ARMED_NS: Final = 10 * NS_PER_S
-"""An autopilot unheard for this long may have been armed since."""
-
 PerSecond = Callable[[str, int], float]
 
 
@@ -149,7 +146,8 @@ def link_status(name: str, counts: LinkCounts, log_ns: int, per_second: PerSecon
         autopilot="" if counts.autopilot is None else "{}/{}".format(*counts.autopilot),
         version=counts.version,
         heartbeats=counts.heartbeats,
-        armed=counts.armed,
+        armed=counts.armed(log_ns),
+        vehicles=["{}/{}".format(*address) for address in counts.vehicles.vehicles()],
         bad_bytes=counts.bad_bytes,
         unknown_frames=counts.unknown_frames,
         dropped_bytes=counts.queue_dropped_bytes,
@@ -229,5 +227,5 @@ def temperature_c(zones: Path = _THERMAL) -> float | None:
 
 def may_fly(links: Sequence[LinkCounts], log_ns: int) -> bool:
     """Whether the vehicle is armed, or nobody heard lately can say that it is not."""
-    heard = [counts.armed for counts in links if log_ns - counts.newest_ns < _ARMED_NS]
+    heard = [counts.armed(log_ns) for counts in links]
     return True in heard or False not in heard

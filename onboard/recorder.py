@@ -1,9 +1,14 @@
 """The flight log's writer: a bounded backlog on which no receiver waits, and segments synced to disk twice a second.
 
+A segment that somebody deleted, a folder that is gone, a disk that fails or turns read-only: the segment is given up,
+and recording begins anew, in another folder if the configuration names one. Data that arrive meanwhile wait in the
+backlog.
+
 It watches the free space. Below a floor it refuses the lidar, and everything else goes on. Below a quarter of that
 floor it closes the log properly and refuses everything, until there is room again.
 """
 
+import contextlib
 import errno
 import logging
 import threading
@@ -40,6 +45,9 @@ _PRESSING: Final = 4
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _RETRY_NS: Final = 5 * NS_PER_S
 """Between two attempts to open a segment on a full disk."""
+_TROUBLE_NS: Final = NS_PER_S
+"""Between two attempts on a disk that fails."""
+_CLOSER_TICK_S: Final = 0.2
 _LIDAR: Final = frozenset((records.LIDAR.topic, records.POSITION.topic))
 """What is not recorded when space is low."""
 
@@ -109,6 +117,12 @@ class RecorderCounts:
     """Messages that were not taken because space was low or out."""
     lost_on_disk: int = 0
     """Messages that were taken, and then the disk was full."""
+    directory: str = ""
+    """Where the segment is."""
+    trouble: str = ""
+    """Why nothing is recorded, or where it is recorded instead."""
+    abandoned: int = 0
+    """Segments that were given up because they were deleted or the disk failed."""
 
 
 class Recorder(Worker):
@@ -118,7 +132,7 @@ class Recorder(Worker):
     ----------
     config : RecorderConfig
     open_segment : callable
-        Opens the next segment; LogError, with an OSError as its cause, where that is not possible.
+        Opens the next segment in a folder; LogError, with an OSError as its cause, where that is not possible.
 
     Raises
     ------
@@ -126,22 +140,24 @@ class Recorder(Worker):
         The first segment cannot be opened, for another reason than a full disk.
     """
 
-    def __init__(self, config: RecorderConfig, open_segment: Callable[[], Segment]) -> None:
+    def __init__(self, config: RecorderConfig, open_segment: Callable[[Path], Segment]) -> None:
         super().__init__("recorder")
         self._config, self._open_segment = config, open_segment
-        self._directory = Path(config.directory)
+        self._folders = [Path(config.directory), *map(Path, config.folders)]
+        self._directory = self._folders[0]
         self._sync_ns = config.sync_ms * NS_PER_MS
         self._floor_bytes = config.min_free_mb << 20
         self._rotation_asked = threading.Event()
         self._retry_ns = 0
         self._told_drops = 0
         self._segment: Segment | None = None
+        self._closer: threading.Thread | None = None
         self._taken: deque[_Item] = deque()
         self._sync_soon = False
         self.backlog = Backlog(config.backlog_mb << 20)
         self.counts = RecorderCounts(last_sync_ns=time.monotonic_ns())
         self._look_at_space()
-        self._begin_segment()
+        self._open_first()
 
     def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
         """Hand over one message; False, at once, if there is no room for it."""
@@ -170,10 +186,14 @@ class Recorder(Worker):
                 left_ns = self.counts.last_sync_ns + self._sync_ns - time.monotonic_ns()
                 self.backlog.pressing.wait(max(0.0, left_ns / NS_PER_S))
                 self.backlog.pressing.clear()
+            if self._segment is None:
+                self._retry_ns = 0
+                self._begin_segment()
             self._until_full(lambda: self._write_until(None))
         finally:
             self._close_segment()
-            logfolder.release_reserve(self._directory)
+            with contextlib.suppress(OSError):
+                logfolder.release_reserve(self._directory)
 
     def stop(self, timeout_s: float = 10.0) -> None:
         """Ask it to end and wait for that."""
@@ -188,16 +208,21 @@ class Recorder(Worker):
             return
         self._sync_soon = False
         self._until_full(self._sync)
+        if self._segment is not None and self._segment.is_deleted:
+            self._abandon(f"{self._segment.path} was deleted while it was being written: what was in it is lost")
         self._look_at_space()
         if self.counts.space is Space.FULL:
             self._close_segment()
-        elif self._segment is None or self._rotation_due(self._segment):
-            self._close_segment()
+        elif self._segment is None:
             self._begin_segment()
+        elif self._rotation_due(self._segment):
+            self._rotate()
 
     def _write_until(self, end_ns: int | None) -> None:
         """Write the backlog; not beyond a time of the monotonic clock [ns] even if more and more comes."""
         begin_ns = time.monotonic_ns()
+        if self._segment is None and self._has_room and not self.stopping:
+            return  # a new segment is tried soon: the backlog holds what comes until then
         while self._taken or self._take():
             item = self._taken.popleft()
             if self._segment is None:
@@ -224,38 +249,109 @@ class Recorder(Worker):
 
     # Segments -----------------------------------------------------------------------------------------------------
 
+    def _rotate(self) -> None:
+        """Go on in a new segment, and close the old one beside the recording.
+
+        Closing takes four syncs or more. Were they waited for, a power cut meanwhile would cost what came since the sync before.
+        """
+        old, self._segment = self._segment, None
+        drops, self._told_drops = self._drops() - self._told_drops, self._drops()
+        self._begin_segment()
+        self._closed()
+        self._closer = threading.Thread(target=self._close, args=(old, drops), name="closer", daemon=True)
+        self._closer.start()
+
+    def _closed(self) -> None:
+        """Wait for the segment before, if it is still being closed."""
+        while self._closer is not None and self._closer.is_alive():
+            self.progress()
+            self._closer.join(_CLOSER_TICK_S)
+        self._closer = None
+
     def _rotation_due(self, segment: Segment) -> bool:
         large = segment.size >= self._config.segment_mb << 20
         return large or segment.age_s >= self._config.segment_s or self._rotation_asked.is_set()
 
+    @property
+    def _has_room(self) -> bool:
+        return self.counts.space is not Space.FULL
+
+    def _open_first(self) -> None:
+        """Open the first segment; a folder that cannot be used is said at once, to whoever starts the daemon."""
+        if not self._has_room:
+            return
+        reasons = self._open_somewhere()
+        if self._segment is None and self._has_room:
+            raise LogError("; ".join(reasons))
+
     def _begin_segment(self) -> None:
-        """Open the next segment, unless the disk is full."""
-        if self.counts.space is Space.FULL or time.monotonic_ns() < self._retry_ns:
+        """Open the next segment, unless the disk is full; where none of the folders will do, try again soon."""
+        if not self._has_room or time.monotonic_ns() < self._retry_ns:
             return
+        reasons = self._open_somewhere()
+        if self._segment is None and self._has_room:
+            self._retry_ns = time.monotonic_ns() + _TROUBLE_NS
+            self._tell_trouble("; ".join(reasons))
+
+    def _open_somewhere(self) -> list[str]:
+        """Open a segment in the first folder that takes one; what is wrong with those before."""
         self._rotation_asked.clear()
-        try:
-            self._segment = self._open_segment()
-        except LogError as error:
-            if not isinstance(error.__cause__, OSError) or error.__cause__.errno not in _FULL:
-                raise
-            self._stop_for_space()
-            return
+        reasons: list[str] = []
+        for directory in self._folders:
+            try:
+                self._segment = self._open_segment(directory)
+            except LogError as error:
+                reasons.append(str(error))
+                if len(self._folders) == 1 and _is_full(error.__cause__):
+                    self._stop_for_space()
+                continue
+            self._directory = directory
+            self._opened(reasons)
+            return reasons
+        return reasons
+
+    def _opened(self, reasons: list[str]) -> None:
+        """Note a segment that was just opened, and say where it is if that is not where it should be."""
+        assert self._segment is not None
         logfolder.hold_reserve(self._directory)
-        self.counts.segment = self._segment.path.name
+        self.counts.segment, self.counts.directory = self._segment.path.name, str(self._directory)
         self.counts.segments += 1
         self._told_drops = self._drops()
+        if reasons:
+            self._tell_trouble(f"recording to {self._directory} instead: {'; '.join(reasons)}")
+        elif self.counts.trouble:
+            _log.warning("recording again, to %s", self._segment.path, extra=event("recording"))
+            self.counts.trouble = ""
+
+    def _tell_trouble(self, sentence: str) -> None:
+        if sentence != self.counts.trouble:
+            _log.critical("%s", sentence, extra=event("disk"))
+        self.counts.trouble = sentence
+
+    def _abandon(self, reason: str) -> None:
+        """Give the segment up as it is; a new one is begun at once."""
+        segment, self._segment = self._segment, None
+        self.counts.abandoned += 1
+        self._tell_trouble(reason)
+        if segment is not None:
+            self.counts.lost_on_disk += segment.lost
+            with contextlib.suppress(OSError):
+                segment.abandon()
 
     def _close_segment(self) -> None:
+        self._closed()
         segment, self._segment = self._segment, None
-        if segment is None:
-            return
+        if segment is not None:
+            self._close(segment, self._drops() - self._told_drops)
+
+    def _close(self, segment: Segment, drops: int) -> None:
+        """Close a segment that nothing is written to any more; the closer's work too."""
         try:
-            segment.close({"refused": self._drops() - self._told_drops})
+            segment.close({"refused": drops})
             _log.info("closed %s", segment.path, extra=event("closed", segment=segment.path.name))
         except OSError as error:
-            if error.errno not in _FULL:
-                raise
-            _log.error("%s could not be closed on a full disk; the next start mends it", segment.path)
+            reason = "on a full disk" if _is_full(error) else f"({error.strerror})"
+            _log.error("%s could not be closed %s; the next start mends it", segment.path, reason)
         finally:
             self.counts.lost_on_disk += segment.lost
 
@@ -265,13 +361,16 @@ class Recorder(Worker):
     # Space --------------------------------------------------------------------------------------------------------
 
     def _until_full(self, step: Callable[[], None]) -> None:
-        """Do something that writes; a full disk closes the segment and ends nothing else."""
+        """Do something that writes; a disk that is full or fails ends the segment and nothing else."""
         try:
             step()
         except OSError as error:
-            if error.errno not in _FULL:
-                raise
-            self._stop_for_space()
+            if _is_full(error):
+                self._stop_for_space()
+                return
+            path = self._directory if self._segment is None else self._segment.path
+            self._abandon(f"{path}: cannot be written ({error.strerror})")
+            self.counts.last_sync_ns = time.monotonic_ns()
 
     def _stop_for_space(self) -> None:
         """The disk is full, whatever it said before."""
@@ -284,13 +383,14 @@ class Recorder(Worker):
         if time.monotonic_ns() < self._retry_ns:
             return
         if self._judge() is not Space.ROOM and self._config.prune_acknowledged:
-            logfolder.prune(self._directory, lambda: self._judge() is Space.ROOM)
+            with contextlib.suppress(OSError):  # a disk that does not let us delete is told by the writing
+                logfolder.prune(self._directory, lambda: self._judge() is Space.ROOM)
         self._set_space(self._judge())
 
     def _judge(self) -> Space:
         try:
             free_bytes = logfolder.free_bytes(self._directory)
-        except (FileNotFoundError, NotADirectoryError):  # it is made with the first segment
+        except OSError:  # it is made with the next segment, or that says what is wrong
             return Space.ROOM
         return logfolder.space(free_bytes, self._floor_bytes, self.counts.space)
 
@@ -298,6 +398,11 @@ class Recorder(Worker):
         if space is not self.counts.space:
             _log.log(*_SPACE_NEWS[space], extra=event("space", space=space.value))
         self.counts.space = space
+
+
+def _is_full(error: BaseException | None) -> bool:
+    """Whether a disk is full, which is no failure of it."""
+    return isinstance(error, OSError) and error.errno in _FULL
 
 
 _SPACE_NEWS: Final = {

@@ -71,6 +71,11 @@ class _HashedFile:
         """Force it on to the disk."""
         os.fdatasync(self._raw.fileno())
 
+    @property
+    def is_deleted(self) -> bool:
+        """Whether nobody can reach it by a name any more."""
+        return os.fstat(self._raw.fileno()).st_nlink == 0
+
     def finish(self) -> str:
         """Sync, make read-only, close; gives the SHA-256."""
         with self._raw:
@@ -141,6 +146,15 @@ class Segment:
     def size(self) -> int:
         """Of the file so far [bytes]."""
         return self._file.size
+
+    @property
+    def is_deleted(self) -> bool:
+        """Whether somebody deleted the file: what is written to it is lost."""
+        return self._file.is_deleted
+
+    def abandon(self) -> None:
+        """Let go of a file that cannot be closed well; the next start mends it, if it is still there."""
+        self._file.close()
 
     @property
     def age_s(self) -> float:

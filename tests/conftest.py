@@ -172,6 +172,15 @@ def recordings() -> Path:
 
 
 @pytest.fixture(scope="session")
+def cases(recordings: Path) -> Path:
+    """Folder of the small inputs that failed once, beside the recordings."""
+    folder = recordings.parent / "cases"
+    if not folder.is_dir():
+        pytest.skip("no folder `cases` beside the recordings")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def monterey_log(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recorded HDL-32E and the copter's telemetry log, imported."""
     from groundproc.cli import main

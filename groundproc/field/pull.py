@@ -5,13 +5,15 @@ import json
 import os
 import re
 import shlex
-import subprocess
+import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from flightlog.errors import SwathError, UsageError
+from flightlog.words import clean
+from groundproc.field import bounded
 
 INCOMING: Final = ".incoming"
 """Folder of what is not verified yet."""
@@ -23,6 +25,18 @@ _CHUNK: Final = 1 << 20
 _OF_THE_FILE: Final = (11, 23, 24)
 """Exit codes of rsync that tell of this file and not of the link."""
 _ACK_BATCH: Final = 500
+_ASK_S: Final = 120.0
+_ANSWER_BYTES: Final = 32 << 20
+"""Of an answer; a manifest has some 600 bytes a segment."""
+_LINE_BYTES: Final = 1 << 16
+_MOST_SEGMENTS: Final = 50_000
+_LARGEST_BYTES: Final = 1 << 40
+"""Of a segment; aboard they end at 64 GB."""
+_SLOWEST_BYTES_S: Final = 2_000
+"""A transfer that is slower on the whole is given up."""
+_LEAST_FETCH_S: Final = 600.0
+_FREE_BYTES: Final = 64 << 20
+"""Left free on the disk here."""
 
 
 class PullError(SwathError):
@@ -76,20 +90,34 @@ class Vehicle:
         """Answer of the gate to a command; PullError where it gives none."""
         words = [*self.ssh(), "--", self.host, command]
         try:
-            done = subprocess.run(words, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=120)
+            done = bounded.run(words, most_bytes=_ANSWER_BYTES, seconds=_ASK_S)
         except FileNotFoundError:
             raise PullError("ssh: is not installed here; apt install openssh-client") from None
-        except subprocess.TimeoutExpired:
-            raise PullError(f"{self.host}: no answer to `{command[:40]}` within 120 s") from None
-        if done.returncode not in accept:
-            raise PullError(f"{self.host}: {_last_line(done.stderr) or f'exit code {done.returncode}'}")
-        return done.stdout
+        except bounded.TooLateError:
+            raise PullError(f"{self.host}: no answer to `{command[:40]}` within {_ASK_S:.0f} s") from None
+        except bounded.TooMuchError:
+            raise PullError(
+                f"{self.host}: more than {_ANSWER_BYTES >> 20} MB came for `{command[:40]}`, expected far less; is it a swathd?"
+            ) from None
+        if done.code not in accept:
+            raise PullError(f"{self.host}: {_last_line(done.errors) or f'exit code {done.code}'}")
+        return done.output.decode("utf-8", errors="replace")
+
+
+def _parsed(text: str) -> Any:
+    """What JSON of another machine says; ValueError where it is none, however long or deep it goes."""
+    if len(text) > _LINE_BYTES:
+        raise ValueError("too long")
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("too deep") from None
 
 
 def armed(vehicle: Vehicle) -> bool | None:
     """Whether the aircraft is armed; None where it does not know. PullError if it cannot be reached."""
     try:
-        answer = json.loads(vehicle.ask("health --json", accept=(0, 1, 2)))
+        answer = _parsed(vehicle.ask("health --json", accept=(0, 1, 2)))
     except ValueError:
         return None
     found = answer.get("armed") if isinstance(answer, dict) else None
@@ -115,19 +143,23 @@ def check_disarmed(vehicle: Vehicle, anyway: bool) -> None:
 
 def segments(vehicle: Vehicle) -> list[Segment]:
     """The closed segments on the aircraft; PullError where its manifest is not one."""
-    found = {}
+    found: dict[str, Segment] = {}
     for number, line in enumerate(vehicle.ask("manifest").splitlines(), 1):
         try:
-            segment = _segment(json.loads(line))
+            segment = _segment(_parsed(line))
         except (ValueError, KeyError, TypeError):
-            raise PullError(f"{vehicle.host}: line {number} of its manifest is none: {line[:60]!r}") from None
+            shown = clean(line, 60)
+            raise PullError(f"{vehicle.host}: line {number} of its manifest is none: {shown}") from None
         found[segment.name] = segment  # a later line of the same file replaces an earlier one
+        if len(found) > _MOST_SEGMENTS:
+            raise PullError(f"{vehicle.host}: its manifest names more than {_MOST_SEGMENTS} segments")
     return list(found.values())
 
 
 def _segment(tree: dict[str, Any]) -> Segment:
     name, size, sha256 = tree["file"], tree["size"], tree["sha256"]
-    if not _NAME.fullmatch(name) or not isinstance(size, int) or size < 0 or not _SHA256.fullmatch(sha256):
+    is_size = type(size) is int and 0 <= size <= _LARGEST_BYTES
+    if not is_size or not _NAME.fullmatch(name) or not _SHA256.fullmatch(sha256):
         raise ValueError(name)
     return Segment(name, size, sha256, tree.get("acknowledged") is True)
 
@@ -216,14 +248,40 @@ def _rsync(vehicle: Vehicle, segment: Segment, part: Path, how: list[str], quiet
     words = ["rsync", "--times", "--partial", f"--timeout={_SILENT_S}", *how, "--rsh", shlex.join(vehicle.ssh())]
     words += [] if quiet else ["--info=progress2"]
     words += ["--", f"{vehicle.host}:{segment.name}", str(part)]
+    seconds = max(_LEAST_FETCH_S, segment.size / _SLOWEST_BYTES_S)
     try:
-        done = subprocess.run(words, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        done = bounded.run(words, most_bytes=1 << 20, seconds=seconds, file_bytes=segment.size + 1, shown=not quiet)
     except FileNotFoundError:
         raise PullError("rsync: is not installed here; apt install rsync") from None
-    if done.returncode:
-        reason = _last_line(done.stderr.replace("\nrsync error", "\n#")) or f"rsync ended with {done.returncode}"
-        broken = PullError if done.returncode in _OF_THE_FILE else LinkError
+    except (bounded.TooLateError, bounded.TooMuchError):
+        raise LinkError(f"{segment.name}: not here after {seconds:.0f} s; the next pull goes on from here") from None
+    if part.exists() and part.stat().st_size > segment.size:
+        part.unlink()
+        raise PullError(f"{segment.name}: {vehicle.host} sends more than the {segment.size} bytes of its manifest")
+    if done.code:
+        reason = _last_line(done.errors.replace("\nrsync error", "\n#")) or f"rsync ended with {done.code}"
+        broken = PullError if done.code in _OF_THE_FILE else LinkError
         raise broken(f"{segment.name}: {reason}; the next pull goes on from here")
+
+
+def check_space(there: list[Segment], directory: Path) -> None:
+    """See that there is room for all that is to come, before anything comes.
+
+    Raises
+    ------
+    PullError
+        There is not.
+    """
+    missing = 0
+    for segment in there:
+        if not (directory / segment.name).exists():
+            part = directory / INCOMING / segment.name
+            missing += segment.size - min(segment.size, part.stat().st_size if part.exists() else 0)
+    free = shutil.disk_usage(directory).free
+    if missing and missing + _FREE_BYTES > free:
+        raise PullError(
+            f"{directory}: {missing / 1e9:.2f} GB are to come and {free / 1e9:.2f} GB are free; make room or name another folder (-o)"
+        )
 
 
 def acknowledge(vehicle: Vehicle, those: list[Segment]) -> None:
@@ -253,6 +311,7 @@ def pull(vehicle: Vehicle, directory: Path, say: Say, *, anyway: bool = False, q
     """
     check_disarmed(vehicle, anyway)
     there = segments(vehicle)
+    check_space(there, directory)
     brought: list[Segment] = []
     here: list[Segment] = []
     troubles: list[str] = []
@@ -274,4 +333,4 @@ def pull(vehicle: Vehicle, directory: Path, say: Say, *, anyway: bool = False, q
 
 def _last_line(text: str) -> str:
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    return lines[-1] if lines else ""
+    return clean(lines[-1], 300) if lines else ""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from flightlog.errors import SwathError
+from flightlog.words import clean
 from onboard import health
 from onboard.health import Level
 
@@ -52,6 +53,17 @@ def status_path(config_path: Path) -> Path:
     return config.load(config_path).status_path(os.environ.get("RUNTIME_DIRECTORY", folder))
 
 
+def is_alive(pid: int) -> bool:
+    """Whether a process is there, whoever it belongs to."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
 def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
     """The verdict on a status file, and the text that tells it."""
     try:
@@ -62,12 +74,15 @@ def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
         reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
         if as_json:
             return Level.CRITICAL, json.dumps({"verdict": Level.CRITICAL.name, "findings": [reason]}, indent=1)
-        return Level.CRITICAL, f"{Level.CRITICAL.name}: {reason}"
+        return Level.CRITICAL, clean(f"{Level.CRITICAL.name}: {reason}")
     boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     now_ns = time.monotonic_ns()
     verdict = health.judge(status, now_ns, boot_id)
+    if status.boot_id == boot_id and not is_alive(status.pid):
+        ended = f"swathd (process {status.pid}) has ended; what follows is its last status"
+        verdict = health.Verdict(Level.CRITICAL, [ended, *verdict.findings])
     if not as_json:
-        return verdict.level, "\n".join(health.report(status, verdict))
+        return verdict.level, "\n".join(map(clean, health.report(status, verdict)))
     tree = {
         "verdict": verdict.level.name,
         "findings": verdict.findings,

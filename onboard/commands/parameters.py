@@ -1,6 +1,7 @@
 """`swathd parameters`: the autopilot's parameters against firmware_config."""
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,6 +41,11 @@ def run(options: argparse.Namespace) -> int:
         if options.all and options.action == "show":
             for name, value in link.read_all().items():
                 print(f"{name},{value:.9g}")
+            if link.counts.bad_names:
+                print(
+                    f"swathd: {link.counts.bad_names} parameters with names that are none were left out",
+                    file=sys.stderr,
+                )
             return 0
         return _compare(options, link, files)
 

@@ -437,19 +437,42 @@ def test_what_a_small_buffer_drops_is_counted_exactly(tmp_path: Path, monterey: 
     assert sum(account.kernel_drops + account.received for account in total) == stream.sent
 
 
-def test_a_disk_that_fails_ends_the_daemon_with_a_sentence_and_keeps_what_it_has(
+def test_a_disk_that_fails_ends_the_segment_with_a_sentence_and_recording_goes_on(
     tmp_path: Path, monterey: Timed
 ) -> None:
+    unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     with running(tmp_path, lidar={"fov": FULL_CIRCLE}) as daemon:
-        resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+        resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
         replay(monterey, daemon.ports)
-        stderr = daemon.process.communicate(timeout=120)[1]
-        assert daemon.process.returncode == 1
-        assert stderr.splitlines()[-1] == "swathd: recorder: File too large"
+        end = time.monotonic() + 60
+        while len(list(daemon.logs.glob("*.mcap"))) < 2:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        resource.prlimit(daemon.process.pid, resource.RLIMIT_FSIZE, unlimited)
+        replay(monterey, daemon.ports)
+        time.sleep(1.0)
+        stderr = daemon.stop()
+        assert daemon.process.returncode == 0
+        assert "00001-000.mcap: cannot be written (File too large)" in stderr
         assert "Traceback" not in stderr
-        packets = scans(daemon.log)
-    assert len(packets) > 300
-    assert packets["data"].tobytes() == b"".join(of(monterey, 2368)[: len(packets)])
+        first, *_, last = sorted(daemon.logs.glob("*.mcap"))
+        with LogReader(first) as reader:
+            assert any(message.topic == records.LIDAR.topic for message in reader.messages())
+        with LogReader(last) as reader:
+            assert not reader.damage
+            kept = sum(len(records.decode_scan(m.data)) for m in reader.messages((records.LIDAR.topic,)))
+        assert kept > 1000
+
+
+def test_a_terminal_that_closes_ends_no_recording(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon:
+        daemon.process.send_signal(signal.SIGHUP)
+        time.sleep(0.5)
+        assert daemon.process.poll() is None
+        daemon.stop()
+        assert daemon.process.returncode == 0
+        with LogReader(daemon.log) as reader:
+            assert not reader.damage
 
 
 def test_recording_goes_on_without_any_autopilot_or_lidar(tmp_path: Path) -> None:

@@ -191,3 +191,24 @@ def test_any_tree_is_a_configuration_or_a_config_error(tree: Any) -> None:
 def test_any_text_is_a_configuration_or_a_config_error(text: str) -> None:
     with suppress(ConfigError):
         config.loads(text, Recorder, "text")
+
+
+def test_aliases_are_refused_before_they_grow(cases: Path) -> None:
+    with pytest.raises(ConfigError, match=r"an alias \(\*\) stands there") as error:
+        config.load(cases / "hostile" / "yaml_alias_bomb.yaml", Recorder)
+    assert len(str(error.value)) < 1000
+
+
+def test_a_byte_order_mark_is_no_key(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + config.dump(Recorder()).encode())
+    assert config.load(path, Recorder) == Recorder()
+
+
+def test_a_file_that_no_configuration_is_and_a_name_that_none_can_have(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"#" * 2_000_000)
+    with pytest.raises(ConfigError, match="is larger than 1024 KiB"):
+        config.load(path, Recorder)
+    with pytest.raises(ConfigError, match="is no name of a file"):
+        config.load("a\0b", Recorder)

@@ -40,6 +40,8 @@ class StandinAutopilot:
         self.mute = False
         """Sends nothing more."""
         self.heard: Counter[str] = Counter()
+        self.count: int | None = None
+        """What it says that it has, where that is not true."""
         self.sets: list[tuple[str, float, int]] = []
         self.lost = 0
         self._frames = 0
@@ -98,7 +100,8 @@ class StandinAutopilot:
             for name in names:
                 self._tell(name)
         elif kind == "PARAM_REQUEST_READ":
-            name = message.param_id if message.param_index == -1 else names[message.param_index]
+            by_name = message.param_index == -1
+            name = message.param_id if by_name else next(iter(names[message.param_index :]), "")
             if name in self.parameters:
                 self._tell(name)
         elif kind == "PARAM_SET":
@@ -118,4 +121,6 @@ class StandinAutopilot:
         value, kind = self.parameters[name]
         single = struct.unpack("<f", struct.pack("<f", value))[0]
         index = list(self.parameters).index(name)
-        self._write(dialect.MAVLink_param_value_message(name.encode(), single, kind, len(self.parameters), index))
+        self._write(
+            dialect.MAVLink_param_value_message(name.encode(), single, kind, self.count or len(self.parameters), index)
+        )

@@ -225,17 +225,18 @@ def test_a_taken_port_is_tried_again_until_it_is_free(free_port: int) -> None:
     assert link.failure is None
 
 
-def test_the_autopilot_is_the_first_that_says_it_is_one() -> None:
+def test_the_autopilot_is_who_sends_attitudes_not_who_is_heard_first() -> None:
     counts = LinkCounts()
     stream = heartbeat(component=154, autopilot=8, base_mode=128) + ATTITUDE + heartbeat(base_mode=128) + ATTITUDE
     stream += heartbeat(component=2, autopilot=4)
     note_frames(counts, FrameParser().feed(1, stream))
     assert counts.autopilot == (1, 1)
-    assert counts.armed is True
+    assert counts.armed(1) is True
     assert counts.heartbeats == 1
-    assert counts.messages == {dialect.MAVLINK_MSG_ID_HEARTBEAT: 1, dialect.MAVLINK_MSG_ID_ATTITUDE: 1}
+    # known for the autopilot by its first attitude, before its heartbeat
+    assert counts.messages == {dialect.MAVLINK_MSG_ID_HEARTBEAT: 1, dialect.MAVLINK_MSG_ID_ATTITUDE: 2}
     note_frames(counts, FrameParser().feed(2, heartbeat(component=154, autopilot=8, base_mode=128) + heartbeat()))
-    assert counts.armed is False
+    assert counts.armed(2) is False
 
 
 def test_frames_of_unknown_ids_are_no_sign_of_life() -> None:
@@ -249,7 +250,9 @@ def test_frames_of_unknown_ids_are_no_sign_of_life() -> None:
 
 
 def test_only_streams_that_come_too_slowly_are_asked_for_again() -> None:
-    counts = LinkCounts(autopilot=(1, 1))
+    counts = LinkCounts()
+    note_frames(counts, FrameParser().feed(1, heartbeat()))
+    counts.messages.clear()
     requester = Requester(StreamsConfig(50, 0, 10, 50, 0, 2))
 
     def asked(now_ns: int) -> list[int]:

@@ -93,3 +93,21 @@ def test_watching_shows_what_changes_until_it_is_interrupted(config: Path) -> No
         process.stdout.read()
     assert "GOOD" in first
     assert process.returncode == 2
+
+
+def test_a_daemon_that_has_ended_is_noticed_at_once(config: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    write(config, now(pid=ended.pid))
+    code, text = call(config)
+    assert code == 2
+    assert f"swathd (process {ended.pid}) has ended" in text
+
+
+def test_words_from_outside_do_not_act_on_the_terminal(config: Path) -> None:
+    write(config, now(lidar=LidarStatus(age_s=0.1, nmea="$GPRMC\x1b[2J\x07\nGOOD: forged")))
+    _, text = call(config)
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert not any(line.startswith("GOOD: forged") for line in text.splitlines())
+    assert r"$GPRMC\x1b[2J\x07\nGOOD: forged" in text

@@ -381,3 +381,27 @@ def test_files_of_ones_own_go_before_the_shipped_and_nothing_is_set_without_a_ye
     assert {name: p.value for name, p in listed.items()} == {n: as_single(v) for n, (v, _) in small().items()}
     assert main(["parameters", "show", "--device", board.device]) == 2
     assert "its firmware is neither ArduCopter 3.1.3 nor ArduPilot 4" in capsys.readouterr().err
+
+
+def test_a_count_that_no_autopilot_has_is_one_sentence(autopilot: Callable[..., Any]) -> None:
+    board = autopilot({"A_B": [1.0, REAL32]})
+    board.count = 65_535
+    expected = "says that it has 65535 parameters, expected 5000 at most"
+    with ParameterLink(LinkConfig(board.device)) as link, pytest.raises(SourceError, match=expected):
+        link.read_all()
+
+
+def test_asking_ends_where_nobody_answers(autopilot: Callable[..., Any]) -> None:
+    board = autopilot({"A_B": [1.0, REAL32]})
+    board.count = 4_000
+    with ParameterLink(LinkConfig(board.device)) as link:
+        with pytest.raises(SourceError, match="3999 parameters did not come"):
+            link.read_all()
+        assert board.heard["PARAM_REQUEST_READ"] < 100
+
+
+def test_names_that_are_none_are_left_out_and_counted(autopilot: Callable[..., Any]) -> None:
+    board = autopilot({"A_B": [1.0, REAL32], "X\x1b[2J": [2.0, REAL32], "Y,9\nZ": [3.0, REAL32]})
+    with ParameterLink(LinkConfig(board.device)) as link:
+        assert link.read_all() == {"A_B": 1.0}
+        assert link.counts.bad_names == 2

@@ -104,7 +104,7 @@ def test_a_full_backlog_refuses_at_once_and_keeps_room_for_small_messages() -> N
 
 
 def test_what_was_handed_over_is_on_the_disk_within_two_syncs_and_complete_at_the_end(tmp_path: Path) -> None:
-    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=100), lambda: segment(tmp_path / "a.mcap"))
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=100), lambda _: segment(tmp_path / "a.mcap"))
     recorder.start()
     assert recorder.put("/mavlink/ins", 10, records.encode_raw(10, [(10, b"one")], "ins"), True)
     synced, end = recorder.counts.syncs, time.monotonic() + 90
@@ -129,7 +129,7 @@ def test_a_sync_follows_what_was_handed_over_when_it_is_nearly_due_and_no_sooner
 ) -> None:
     now_ns = 10**12
     monkeypatch.setattr("onboard.recorder.time", SimpleNamespace(monotonic_ns=lambda: now_ns))
-    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=4000), lambda: segment(tmp_path / "a.mcap"))
+    recorder = Recorder(RecorderConfig(str(tmp_path), sync_ms=4000), lambda _: segment(tmp_path / "a.mcap"))
     begin_ns = now_ns
     # of 4 s, seven eighths are near; what nobody says is handed over waits for the end of the four
     for at_ms, told, syncs in ((100, True, 0), (3499, True, 0), (3500, True, 1), (7400, False, 1), (7500, False, 2)):

@@ -42,7 +42,7 @@ def stalled(tmp_path: Path) -> tuple[Recorder, Stall]:
     first = (records.HOST_CLOCK.topic, 5, records.encode_host_clock(HostClock(5, 6, 7, 8)))
     segment = Segment(tmp_path / "00001-000.mcap", {}, {}, ["/mavlink/ins"], first)
     config = RecorderConfig(str(tmp_path), sync_ms=50, backlog_mb=4)
-    return Recorder(config, lambda: segment), Stall(segment)
+    return Recorder(config, lambda _: segment), Stall(segment)
 
 
 def lidar(log: Path) -> list[int]:

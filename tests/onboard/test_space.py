@@ -33,7 +33,7 @@ def opened(directory: Path) -> Segment:
 
 def recorder(directory: Path, **options: int) -> Recorder:
     config = RecorderConfig(str(directory), sync_ms=50, **options)  # type: ignore[arg-type]
-    return Recorder(config, lambda: opened(directory))
+    return Recorder(config, opened)
 
 
 @pytest.fixture

@@ -1,0 +1,140 @@
+"""An aircraft, or whoever sits on its address, that answers with what it should not: real processes in the place of ssh."""
+
+import hashlib
+import json
+import os
+import resource
+import sys
+from pathlib import Path
+
+import pytest
+
+from groundproc.field import bounded, pull
+
+GOOD = {"file": "00001-000.mcap", "size": 5, "sha256": hashlib.sha256(b"12345").hexdigest()}
+
+
+@pytest.fixture
+def answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A script that is found as `ssh`: it answers the gate's commands with what stands in files, and serves rsync from a folder."""
+    there = tmp_path / "there"
+    there.mkdir()
+    (there / "health").write_text('{"armed": false}')
+    script = tmp_path / "bin" / "ssh"
+    script.parent.mkdir()
+    script.write_text(
+        f"""#!/bin/sh
+for word; do last=$word; done
+cd {there}
+case "$*" in
+*"rsync --server"*) while [ "$1" != rsync ]; do shift; done; exec "$@" ;;
+*health*) cat health ;;
+*manifest*) if [ -f endless ]; then yes '{json.dumps(GOOD)}'; else cat manifest; fi ;;
+*ack*) echo acknowledged ;;
+esac
+"""
+    )
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{script.parent}:{os.environ['PATH']}")
+    return there
+
+
+def manifest(there: Path, *lines: bytes) -> None:
+    (there / "manifest").write_bytes(b"\n".join(lines) + b"\n")
+
+
+def sentence(directory: Path) -> str:
+    with pytest.raises(pull.PullError) as error:
+        pull.pull(pull.Vehicle("a@b"), directory, lambda _: None)
+    text = str(error.value)
+    assert text.isprintable()
+    return text
+
+
+def test_the_stand_in_is_pulled_from_as_an_aircraft_is(answer: Path, tmp_path: Path) -> None:
+    manifest(answer, json.dumps(GOOD).encode())
+    (answer / "00001-000.mcap").write_bytes(b"12345")
+    here = tmp_path / "here"
+    here.mkdir()
+    outcome = pull.pull(pull.Vehicle("a@b"), here, lambda _: None)
+    assert outcome.troubles == []
+    assert (here / "00001-000.mcap").read_bytes() == b"12345"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"[" * 60_000,
+        b'{"file":' * 9_000,
+        b"\xff\xfe\x00 \x1b[2J",
+        json.dumps(GOOD | {"size": 2**70}).encode(),
+        json.dumps(GOOD | {"size": True}).encode(),
+        json.dumps(GOOD | {"size": 1e3}).encode(),
+        b'{"file": "' + b"x" * 1_000_000 + b'"}',
+        b"null",
+        b"[1, 2]",
+    ],
+    ids=["deep", "deep objects", "no text", "huge size", "size true", "size 1e3", "long", "null", "list"],
+)
+def test_a_line_that_is_none_is_one_sentence(answer: Path, tmp_path: Path, line: bytes) -> None:
+    manifest(answer, json.dumps(GOOD).encode(), line)
+    assert "line 2 of its manifest is none" in sentence(tmp_path)
+
+
+def test_a_manifest_without_end_takes_little_memory_and_ends(answer: Path, tmp_path: Path) -> None:
+    (answer / "endless").touch()
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "more than 32 MB came for `manifest`" in sentence(tmp_path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 300_000
+
+
+def test_more_than_the_manifest_says_is_not_taken(answer: Path, tmp_path: Path) -> None:
+    manifest(answer, json.dumps(GOOD).encode())
+    (answer / "00001-000.mcap").write_bytes(b"x" * 50_000_000)
+    here = tmp_path / "here"
+    here.mkdir()
+    outcome = pull.pull(pull.Vehicle("a@b"), here, lambda _: None)
+    (trouble,) = outcome.troubles
+    assert trouble.startswith("00001-000.mcap: ")
+    assert outcome.acknowledged == 0
+    assert sum(path.stat().st_size for path in here.rglob("*") if path.is_file()) <= 6
+
+
+def test_space_is_asked_for_before_anything_comes(answer: Path, tmp_path: Path) -> None:
+    manifest(answer, json.dumps(GOOD | {"size": 1 << 40}).encode())
+    text = sentence(tmp_path)
+    assert "1099.51 GB are to come" in text
+    assert not (tmp_path / pull.INCOMING).exists()
+
+
+def test_a_health_that_goes_deep_is_no_knowledge(answer: Path, tmp_path: Path) -> None:
+    (answer / "health").write_text("[" * 20_000)
+    assert "whether it is armed is not known" in sentence(tmp_path)
+
+
+def test_a_child_that_hangs_is_ended() -> None:
+    with pytest.raises(bounded.TooLateError):
+        bounded.run(["sleep", "600"], most_bytes=1, seconds=0.3)
+
+
+def test_a_child_that_complains_without_end_takes_little_memory() -> None:
+    script = "import sys\nfor _ in range(40): sys.stderr.write('x' * (1 << 20))\nsys.stderr.write('the end')"
+    done = bounded.run([sys.executable, "-c", script], most_bytes=1, seconds=60.0)
+    assert done.code == 0
+    assert done.errors.endswith("the end")
+    assert len(done.errors) <= 1 << 16
+
+
+def test_a_child_cannot_write_a_file_beyond_its_limit(tmp_path: Path) -> None:
+    words = ["dd", "if=/dev/zero", f"of={tmp_path / 'x'}", "bs=1k", "count=100"]
+    done = bounded.run(words, most_bytes=1, seconds=60.0, file_bytes=2048)
+    assert done.code != 0
+    assert (tmp_path / "x").stat().st_size <= 2048
+
+
+def test_words_of_the_other_side_do_not_act_on_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = tmp_path / "ssh"
+    script.write_text("#!/bin/sh\nprintf 'denied\\033[2J\\007 forged' >&2\nexit 255\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert sentence(tmp_path) == r"a@b: denied\x1b[2J\x07 forged"
