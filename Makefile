@@ -1,5 +1,5 @@
 # The one task runner; CI calls it too.
-#   make setup       the environment: apt packages where they are missing, .venv with everything
+#   make setup       the environment: apt packages where they are missing, .venv with everything, kernels compiled
 #   make demo        a simulated flight into the real daemon, processed to a cloud with pictures
 #   make test        all tests but the long ones
 #   make check       format, lint, types, import contracts, then the tests
@@ -50,6 +50,7 @@ $(VENV)/.python: $(VENV)/.apt
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@$(BIN)/swath warmup || echo "warning: swath warmup failed: what is not compiled yet is compiled at first use" >&2
 	@touch $@
 
 demo: setup

@@ -36,18 +36,18 @@ from flightlog.mount import Mount
 from groundproc.accuracy.alignment import align
 from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
 from groundproc.cloud.georeference import georeference
-from groundproc.cloud.placing import Tally, chunks
-from groundproc.estimation import methods
-from groundproc.estimation.dynamic.options import ROBUST, SOURCE, DynamicOptions
+from groundproc.estimation import direct
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import Found, Search
 from groundproc.estimation.dynamic.trims import applied, interpolated
 from groundproc.estimation.method import Given, gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
+from groundproc.flight.shots import shots
 from groundproc.flight.timeline import Leg, legs
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 from groundproc.survey import Survey
+from groundproc.survey.dynamic import ROBUST, SOURCE, DynamicOptions
 from groundproc.trajectory.trajectory import Trajectory
 
 mpl.use("Agg")
@@ -107,12 +107,12 @@ def cloud(
 ) -> tuple[Array, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Some points placed with a trajectory, their times, and a number for each that is the same in all clouds."""
     places, times, lasers = [], [], []
-    for packets, utc_ns in chunks(given.readers, given.timeline, Tally(), lambda _: None):
-        points = georeference(packets, utc_ns, trajectory, mount, GATE)
+    for seen in shots(given.readers, given.timeline, GATE):
+        points = georeference(seen, trajectory, mount)
         kept = points.time_ns // FIRING_NS % EVERY == 0
         places.append(points.xyz_m[kept])
         times.append(points.time_ns[kept])
-        lasers.append(points.laser[kept])
+        lasers.append(points["laser"][kept])
     time_ns = np.concatenate(times)
     keys = (time_ns - given.readers[0].start_ns) * LASERS + np.concatenate(lasers)
     return np.concatenate(places), time_ns, keys
@@ -177,7 +177,7 @@ def experiment(name: str, folder: Path, results: Path) -> dict[str, Any]:
         flight = read_flight([reader], "ins")
         timeline: list[Leg] = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), survey.sync)
         given = gather([reader], flight, timeline, mount, survey)
-        start = methods.ins_estimate(given, lambda *_: None).trajectory
+        start = direct.ins_estimate(given, lambda *_: None).trajectory
         none = np.empty(0, np.int64)
         made = {
             "ins": Made(start, none, np.empty(0), None),

@@ -43,7 +43,7 @@ from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
 from groundproc.flight.sync.result import Sync
 from groundproc.flight.timeline import legs
-from groundproc.sensors.hdl32e import LaserTable
+from groundproc.sensors.shots import LaserTable
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -160,7 +160,8 @@ def _method(name: str, truth: Truth, reader: LogReader) -> Made:
         raise SystemExit(f"{reader.path}: the lidar's clock was set in flight, expected one run of it")
     placed = on_lidar_clock(estimate.trajectory, timeline[0].lidar_line, truth)
     tie = tie_errors(timeline[0].sync, truth)
-    return Made(placed, estimate.mount, estimate.lasers, True, *spent, estimate.warning, estimate.report, tie)
+    lasers = estimate.corrections.table(flight.lidar.lasers)
+    return Made(placed, estimate.mount, lasers, True, *spent, estimate.warning, estimate.report, tie)
 
 
 def tie_errors(sync: Sync, truth: Truth) -> dict[str, float]:

@@ -1,14 +1,27 @@
-"""Writes docs/log-format.md from the table of records, so that the page and the programs cannot differ.
+"""Writes the pages that are tables of the programs, so that page and programs cannot differ.
 
-Run it after a change of flightlog/records.py: python docs/generate.py
+log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
+groundproc/products, survey.md from the dataclasses of groundproc/survey, the table in methods/observations.md from the registry of
+groundproc/estimation/observations. Run it after a change of these: python docs/generate.py
 """
 
+import dataclasses
+import importlib
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from flightlog.records import FORMAT_VERSION, TABLE, RecordType
+from groundproc import products
+from groundproc.cloud import dimensions
+from groundproc.cloud.dimensions import Dimension
+from groundproc.estimation import observations
+from groundproc.survey import SECTIONS, Survey, sample
+from groundproc.survey.dynamic import DynamicOptions
+from groundproc.survey.setting import command_of, default_of, value_text
 
-PAGE: Final = Path(__file__).with_name("log-format.md")
+DOCS: Final = Path(__file__).parent
 
 _RULE: Final = "=" * 80 + "\nMSG: "
 _STANDARD: Final = ("std_msgs/Header", "builtin_interfaces/Time")
@@ -42,7 +55,7 @@ _TAIL: Final = """\
 |---|---|
 | `swath.log` | `format_version`. A reader refuses a version above its own, and reads every one below. |
 | `swath.topics` | What channel number means which topic, and `crc32` of that, at the flushes number 1, 2, 4, 8 and so on: see below. |
-| `swath.session` | Who wrote the log, with which version, on what host or from which files. |
+| `swath.session` | Who wrote the log, with which version, on what host or from which files; `lidar`: its [model](sensors.md). |
 
 Of a name that occurs more than once, the last one counts. MCAP itself says the channel numbers in the first chunk and in the summary
 only; with `swath.topics` a log that was cut off and lost its first chunk can still be read.
@@ -94,5 +107,172 @@ def _section(row: RecordType) -> str:
     return "\n".join(parts)
 
 
+_DIMENSIONS: Final = """\
+# Attributes of points
+
+<!-- Made by docs/generate.py from groundproc/cloud/dimensions.py: change that, not this. -->
+
+Every cloud that `swath` writes or reads has its attributes from this table. LAS files are of version 1.4, point format 6; with colours 7,
+with near infrared 8. What the standard has no field for is in extra bytes of the same name, whose description in the file says the unit.
+A file holds what something filled, and no more. In the program a column has the name and the unit that stand here.
+
+A *step* is the least difference that the file can hold; the value is the stored number times the step.
+
+## Every point
+"""
+
+_READING: Final = """\
+## Clouds of other programs
+
+LAS and LAZ of every version and point format are read. Fields of the standard are taken as they are. Extra bytes are taken as an attribute
+of this table if they have its name, their description states its unit, and its column can hold them. A cloud that is written anew with
+other coordinates (`swath adjust`) keeps all its fields and extra bytes, those that stand nowhere here too.
+"""
+
+_PRODUCTS: Final = """\
+# Products
+
+<!-- Made by docs/generate.py from the registry of groundproc/products: change that, not this. -->
+
+`swath process` makes these. `products` in survey.yaml, or `--products`, chooses:
+
+```yaml
+products: [cloud.laz, pictures]
+```
+
+A product with options of its own is a mapping of its name to them: `{NAME: {OPTION: VALUE}}`. Whatever is chosen, `trajectory.csv` and
+`quality.json` are there. Each product is written aside and gets its name when it is whole; an error says which product it is of. A product
+of a method is made only where that method ran.
+
+| name | by default | what it is |
+|---|---|---|
+"""
+
+
+def dimensions_page() -> str:
+    """docs/dimensions.md."""
+    parts = [_DIMENSIONS, _attributes(dimensions.PLACED), "## Attributes\n", _attributes(dimensions.TABLE), _READING]
+    return "\n".join(parts)
+
+
+def _attributes(entries: Iterable[Dimension]) -> str:
+    rows = [
+        "| name | unit | in the file | step | least | largest | meaning | filled by |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for entry in entries:
+        low, high = (f"{value:.7g}" for value in entry.limits()) if entry.stored.kind != "f" else ("", "")
+        place = f"`{entry.field}`" if entry.field else "extra bytes"
+        step = "" if entry.scale is None else f"{entry.scale:g}"
+        about = entry.about + ("" if entry.no_data is None else f" {entry.no_data}: not known.")
+        rows.append(
+            f"| `{entry.name}` | {entry.unit} | {place}, {entry.dtype} | {step} | {low} | {high} | {about} | {entry.source} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def products_page() -> str:
+    """docs/products.md."""
+    rows = [
+        f"| `{name}` | {'yes' if entry.by_default else 'no'} | {entry.about} |"
+        for name, entry in products.REGISTRY.items()
+    ]
+    return _PRODUCTS + "\n".join(rows) + "\n"
+
+
+_KINDS: Final = re.compile(r"(<!-- kinds: [^\n]*-->\n).*?(<!-- end of kinds -->)", re.DOTALL)
+
+
+def observations_page() -> str:
+    """docs/methods/observations.md: the table of kinds within the page as it is."""
+    rows = ["| kind | what it is | adjustment | smoother |", "|---|---|---|---|"]
+    for name, path in observations.KINDS.items():
+        module = importlib.import_module(path)
+        used = ["yes" if hasattr(module, function) else "" for function in ("of_run", "of_leg")]
+        about = (module.__doc__ or "").partition("\n")[0]
+        rows.append(f"| `{name}` | {about} | {used[0]} | {used[1]} |")
+    before = (DOCS / "methods/observations.md").read_text(encoding="utf-8")
+    return _KINDS.sub(lambda found: found[1] + "\n".join(rows) + "\n" + found[2], before)
+
+
+_SURVEY: Final = """\
+# What you choose: survey.yaml
+
+<!-- Made by docs/generate.py from the dataclasses of groundproc/survey: change those, not this. -->
+
+`swath process LOG -o DIR --config survey.yaml` reads this file. Every key is optional. An option on the command line goes before the file.
+`swath init LOG -o survey.yaml` writes one for a flight, with what the log tells about each option. A name of a file in it is looked for
+beside it. An unknown key, a value that cannot be, and an option that the chosen method would not look at are errors.
+
+`swath process --help` lists the options of the command line. `swath completion bash` (or `zsh`, `fish`) prints a script that completes
+them.
+"""
+
+
+def survey_page() -> str:
+    """docs/survey.md: every option, step by step, and the whole file."""
+    parts = [_SURVEY]
+    for section in SECTIONS:
+        assert section.__doc__ is not None
+        title, _, about = section.__doc__.splitlines()[0].partition(": ")
+        parts += [f"\n## {title}\n", f"{about[0].upper()}{about[1:]}\n"]
+        parts += ["| key | command line | default | what it is |", "|---|---|---|---|"]
+        parts += [_option_row(field) for field in dataclasses.fields(section)]
+    parts += [
+        "",
+        "## Method dynamic",
+        "",
+        "Keys below `dynamic:`.",
+        "",
+        "| key | default | what it is |",
+        "|---|---|---|",
+    ]
+    parts += _nested_rows(DynamicOptions(), "")
+    parts += ["", "## The whole file", "", "```yaml", sample(Survey(), {}).rstrip(), "```", ""]
+    return "\n".join(parts)
+
+
+def _option_row(field: "dataclasses.Field[Any]") -> str:
+    command, value = command_of(field), default_of(field)
+    flag = isinstance(value, bool)
+    words = ", ".join(f"`{word}{'' if flag else f' {_value_name(field)}'}`" for word in command.words)
+    default = "see below" if dataclasses.is_dataclass(value) else f"`{value_text(value)}`"
+    return f"| `{field.name}` | {words or 'not there'} | {default} | {_cell(field)} |"
+
+
+def _value_name(field: "dataclasses.Field[Any]") -> str:
+    choices = field.metadata.get("choices")
+    return "\\|".join(choices) if choices else command_of(field).metavar
+
+
+def _nested_rows(options: Any, above: str) -> list[str]:
+    rows: list[str] = []
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            rows += _nested_rows(value, f"{field.name}.")
+        else:
+            rows.append(f"| `{above}{field.name}` | `{value_text(value)}` | {_cell(field)} |")
+    return rows
+
+
+def _cell(field: "dataclasses.Field[Any]") -> str:
+    """What an option is, its choices and its bounds."""
+    about, rules = field.metadata["about"], field.metadata
+    if rules.get("choices"):
+        about += f" ({', '.join(f'`{choice}`' for choice in rules['choices'])})"
+    low, high = rules.get("minimum"), rules.get("maximum")
+    if low is not None or high is not None:
+        about += f" ({'' if low is None else f'{low:g}'} to {'' if high is None else f'{high:g}'})"
+    return about.replace("|", "\\|")
+
+
+PAGES: Final[dict[str, Callable[[], str]]] = {
+    "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
+    "methods/observations.md": observations_page,
+}  # fmt: skip
+
+
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    for name, made in PAGES.items():
+        (DOCS / name).write_text(made(), encoding="utf-8")

@@ -22,6 +22,9 @@ POSITION_BYTES: Final = 512
 BLOCKS: Final = 12
 LASERS: Final = 32
 BLOCK_FLAG: Final = 0xEEFF
+LOWER_BLOCK_FLAG: Final = 0xDDFF
+"""Flag of the blocks of the lower 32 lasers of an HDL-64E, which has no product byte (63-HDL64ES3 Rev K, appendix E)."""
+HDL_64E: Final = "HDL-64E"
 PRODUCT_ID: Final = 0x21
 """Byte 1205 of a data packet. Necessary, not sufficient: a VLP-16 prototype sent it too [measured]."""
 OTHER_PRODUCTS: Final = {
@@ -139,6 +142,13 @@ def is_data(packets: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
     return np.asarray(flags & ((known & (product == PRODUCT_ID)) | blank))
 
 
+def is_hdl64e(packets: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Which packets of DATA_DTYPE are an HDL-64E's: blocks of upper and lower lasers, and no other; shape (n,)."""
+    flags = packets["blocks"]["flag"]
+    lower = flags == LOWER_BLOCK_FLAG
+    return np.asarray((lower | (flags == BLOCK_FLAG)).all(axis=1) & lower.any(axis=1) & ~lower.all(axis=1))
+
+
 def check_data(payload: bytes, place: str) -> None:
     """Refuse what is not a data packet of an HDL-32E.
 
@@ -159,6 +169,8 @@ def check_data(payload: bytes, place: str) -> None:
     if len(payload) != DATA_BYTES:
         raise PacketError(f"{place}: a data packet has {DATA_BYTES} bytes, this one {len(payload)}")
     packet = np.frombuffer(payload, DATA_DTYPE)
+    if is_hdl64e(packet)[0]:
+        raise WrongSensorError(f"{place}: blocks that start with FF DD are an {HDL_64E}'s; an HDL-32E is needed")
     if not (packet["blocks"]["flag"] == BLOCK_FLAG).all():
         raise PacketError(f"{place}: 1206 bytes, but not every block starts with FF EE")
     product = int(packet["product"][0])

@@ -146,7 +146,29 @@ CLOCK_SYNC: Final = RecordType(
     "The raw stamps, receive times and TIMESYNC messages are in the other topics, and can be fitted better afterwards.",
 )
 
-TABLE: Final = (LIDAR, LIDAR_ACCOUNT, POSITION, MAVLINK, DATAFLASH, HOST_CLOCK, CLOCK_SYNC)
+LINE_SCAN: Final = RecordType(
+    "/line_scan",
+    "sensor_msgs/msg/LaserScan",
+    _definition(
+        "std_msgs/Header header\n"
+        "# from the scanner's x (right) towards its y (forward), negative clockwise seen from above [rad]\n"
+        "float32 angle_min\n"
+        "float32 angle_max\n"
+        "float32 angle_increment\n"
+        "# from shot to shot, and from line to line [s]\n"
+        "float32 time_increment\n"
+        "float32 scan_time\n"
+        "float32 range_min\n"
+        "float32 range_max\n"
+        "# not a number or 0: no return [m]\n"
+        "float32[] ranges\n"
+        "float32[] intensities\n"
+    ),
+    "A line of a line scanner, one in a message; the stamp is UTC of its first shot, on the time base of the whole kit. "
+    "Only in logs that were imported.",
+)
+
+TABLE: Final = (LIDAR, LIDAR_ACCOUNT, POSITION, MAVLINK, DATAFLASH, HOST_CLOCK, CLOCK_SYNC, LINE_SCAN)
 """All record types, in the order of the documentation."""
 
 
@@ -305,6 +327,58 @@ def decode_position(data: bytes | memoryview) -> tuple[npt.NDArray[np.int64], np
     chunks = [chunk for chunk in decode_raw(data) if len(chunk[1]) == POSITION_BYTES]
     packets = np.frombuffer(b"".join(chunk for _, chunk in chunks), POSITION_DTYPE)
     return np.array([time_ns for time_ns, _ in chunks], np.int64), packets
+
+
+# Lines of a line scanner ----------------------------------------------------------------------------------------------
+
+
+def line_dtype(shots: int) -> np.dtype[np.void]:
+    """A line of so many shots; angles in rad as in the definition of /line_scan, times in s, ranges in m."""
+    values = ("<f4", (shots,))
+    return np.dtype([
+        ("time_ns", "<i8"), ("angle_min", "<f4"), ("angle_increment", "<f4"), ("time_increment", "<f4"),
+        ("scan_time", "<f4"), ("ranges", *values), ("intensities", *values),
+    ])  # fmt: skip
+
+
+_LINE: Final = struct.Struct("<7f")
+
+
+def encode_line(line: npt.NDArray[np.void]) -> bytes:
+    """Encode one line, an array of `line_dtype` of shape ()."""
+    ranges, intensities = line["ranges"], line["intensities"]
+    first, step = float(line["angle_min"]), float(line["angle_increment"])
+    seen = ranges[np.isfinite(ranges) & (ranges > 0.0)]
+    near, far = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 0.0)
+    last = first + (len(ranges) - 1) * step
+    fixed = _LINE.pack(first, last, step, float(line["time_increment"]), float(line["scan_time"]), near, far)
+    count = struct.pack("<I", len(ranges))
+    head = _header(int(line["time_ns"]), "line_scanner")
+    return b"".join((head, fixed, count, ranges.tobytes(), count, intensities.tobytes()))
+
+
+def decode_line(data: bytes | memoryview) -> npt.NDArray[np.void]:
+    """Decode a LaserScan to an array of `line_dtype` of shape (1,).
+
+    Raises
+    ------
+    LogError
+        Bytes that are no LaserScan, or one with other numbers of ranges and intensities.
+    """
+    time_ns, _, offset = _open_header(data, LINE_SCAN.topic)
+    end = offset + _LINE.size
+    if end > len(data):
+        raise LogError(f"{LINE_SCAN.topic}: {len(data)} bytes, expected at least {end}")
+    first, _, step, time_step, scan_time, _, _ = _LINE.unpack_from(data, offset)
+    shots = _count(data, end, LINE_SCAN.topic)
+    if len(data) < end + 8 + 8 * shots or _count(data, end + 4 + 4 * shots, LINE_SCAN.topic) != shots:
+        raise LogError(f"{LINE_SCAN.topic}: {len(data)} bytes, expected {end + 8 + 8 * shots} for {shots} shots")
+    line = np.zeros(1, line_dtype(shots))
+    line["time_ns"], line["angle_min"], line["angle_increment"] = time_ns, first, step
+    line["time_increment"], line["scan_time"] = time_step, scan_time
+    line["ranges"] = np.frombuffer(data, "<f4", shots, end + 4)
+    line["intensities"] = np.frombuffer(data, "<f4", shots, end + 8 + 4 * shots)
+    return line
 
 
 # Accounts and clocks --------------------------------------------------------------------------------------------------

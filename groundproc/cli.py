@@ -1,17 +1,21 @@
 """`swath`: finds its commands by entry points, runs one, and turns errors of the outside world into one sentence."""
 
 import argparse
+import contextlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from types import FrameType
 from typing import Final
 
 GROUP: Final = "swath.commands"
 OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
 _INTERRUPTED: Final = 128 + signal.SIGINT
+_TERMINATED: Final = 128 + signal.SIGTERM
 _BROKEN_PIPE: Final = 128 + signal.SIGPIPE
 
 
@@ -21,12 +25,19 @@ def commands() -> dict[str, EntryPoint]:
     return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: a command cleans up after it as after Ctrl-C."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `swath` and give its exit code: 0, 1 for what went wrong outside, 2 for a wrong command line."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        code = _dispatch(words)
-        sys.stdout.flush()
+        with _terminable():
+            code = _dispatch(words)
+            sys.stdout.flush()
+    except Terminated:
+        return _TERMINATED
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
@@ -37,6 +48,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         sentence, code = _outside(error)
         print(f"swath: {sentence}", file=sys.stderr)
     return code
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM as an exception, so that what is half-written is removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _outside(error: Exception) -> tuple[str, int]:

@@ -405,7 +405,9 @@ class LidarPort(Worker):
     def _tell_foreign(self, packets: npt.NDArray[np.void]) -> None:
         """Name what has a data packet's length and is none of an HDL-32E."""
         flagged = (packets["blocks"]["flag"] == hdl32e.BLOCK_FLAG).all(axis=1)
-        self._reject(lidarstate.WRONG_CONTENT, int((~flagged).sum()))
+        taller = hdl32e.is_hdl64e(packets)
+        self._reject(f"{lidarstate.WRONG_MODEL}: {hdl32e.HDL_64E}", int(taller.sum()))
+        self._reject(lidarstate.WRONG_CONTENT, int((~flagged & ~taller).sum()))
         for product, count in Counter(packets["product"][flagged].tolist()).items():
             name = hdl32e.OTHER_PRODUCTS.get(product, f"unknown return mode or product 0x{product:02x}")
             self._reject(f"{lidarstate.WRONG_MODEL}: {name}", count)

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog.hdl32e import RANGE_LSB_M
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy import patches
@@ -23,8 +22,8 @@ from groundproc.accuracy.truth import Truth, shot_numbers
 from groundproc.cloud.georeference import georeference
 from groundproc.cloud.points import Points
 from groundproc.flight import load
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors.hdl32e import Gate, LaserTable
+from groundproc.flight.lidar import lidar_of
+from groundproc.sensors.shots import Gate, LaserTable, Shots, turns
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -32,7 +31,6 @@ Times = npt.NDArray[np.int64]
 
 GATE: Final = Gate(255.0, 105.0, 1.0, 100.0)
 """What `swath process` lets through by default."""
-CHUNK_PACKETS: Final = 1808
 PASS_NS: Final = 2_000_000_000
 """Points of so long a time are one pass over a facade."""
 SAME_ECHO_M: Final = 0.5
@@ -181,28 +179,34 @@ def judge_cloud(
     """
     sums = _Sums(truth, section)
     hits = truth.hits()
-    for packets, time_ns, revolution in _pieces(readers, truth):
-        floor = georeference(packets, time_ns, truth.trajectory, truth.mount, gate)
-        placed = georeference(packets, time_ns, estimated, mount, gate, lasers)
-        echoes, numbers = hits.until(int(time_ns[-1]) + 10**6)
-        sums.add(placed, floor, motion, echoes, numbers, time_ns, revolution)
+    for best, shots, begins_ns, revolution in _pieces(readers, truth, gate, lasers):
+        floor = georeference(best, truth.trajectory, truth.mount)
+        placed = georeference(shots, estimated, mount)
+        echoes, numbers = hits.until(int(best.time_ns[-1]) + 10**6)
+        sums.add(placed, floor, motion, echoes, numbers, begins_ns, revolution)
     return sums.result()
 
 
 def _pieces(
-    readers: Sequence[LogReader], truth: Truth
-) -> Iterator[tuple[npt.NDArray[np.void], Times, npt.NDArray[np.int64]]]:
-    """About a second of packets of one return mode, their lidar times as the truth counts them, and their revolutions."""
+    readers: Sequence[LogReader], truth: Truth, gate: Gate, lasers: LaserTable | None
+) -> Iterator[tuple[Shots, Shots, Times, npt.NDArray[np.int64]]]:
+    """About a second of shots on the truth's clock, with the manual's lasers and with the given ones; and the begins of their turns.
+
+    The last two are times [ns], shape (k,), from each of which on the shots are of a revolution, and its number.
+    """
+    lidar = lidar_of(readers)
     waiting: list[load.LidarBatch] = []
-    turns = _Turns()
-    for batch in [*load.lidar_batches(readers), None]:
-        full = sum(len(each.packets) for each in waiting) >= CHUNK_PACKETS
+    counted = _Turns()
+    for batch in [*load.lidar_batches(readers, None, lidar), None]:
+        full = sum(len(each.packets) for each in waiting) >= lidar.records_s
         if waiting and (batch is None or full):
             packets = load.joined([each.packets for each in waiting])
-            device_ns = truth.from_device_ns(np.concatenate([each.device_time_ns for each in waiting]))
+            time_ns = truth.from_device_ns(np.concatenate([each.device_time_ns for each in waiting]))
             waiting = []
-            for part, time_ns in decode.by_mode(packets, device_ns):
-                yield part, time_ns, turns.count(part["data"]["blocks"]["azimuth"][:, 0])
+            both = zip(lidar.decode(packets, time_ns, gate), lidar.decode(packets, time_ns, gate, lasers), strict=True)
+            for best, shots in both:
+                if len(best):
+                    yield best, shots, *counted.count(best)
         if batch is not None and len(batch.packets):
             waiting.append(batch)
 
@@ -211,15 +215,16 @@ class _Turns:
     """Counts the revolutions of the lidar, from behind to behind, where nothing is seen."""
 
     def __init__(self) -> None:
-        self._before, self._number = 0, 0
+        self._last_rad: float | None = None
+        self._number = 0
 
-    def count(self, azimuth_cdeg: npt.NDArray[np.uint16]) -> npt.NDArray[np.int64]:
-        """The revolution of each packet, of the azimuth of its first block [0.01 deg], shape (n,)."""
-        past = (azimuth_cdeg.astype(np.int64) + 18_000) % 36_000
-        turned = np.diff(past, prepend=self._before) < -18_000
-        numbers = self._number + np.cumsum(turned)
-        self._before, self._number = int(past[-1]), int(numbers[-1])
-        return numbers
+    def count(self, shots: Shots) -> tuple[Times, npt.NDArray[np.int64]]:
+        """From which times on shots are of which revolution, shape (k,) each."""
+        azimuth = shots.azimuth_rad
+        begins = turns(azimuth, self._last_rad)
+        numbers = self._number + np.arange(len(begins) + 1)
+        self._last_rad, self._number = float(azimuth[-1]), int(numbers[-1])
+        return np.concatenate([shots.time_ns[:1], shots.time_ns[begins]]), numbers
 
 
 class _Sums:
@@ -245,16 +250,16 @@ class _Sums:
         motion: Rigid,
         echoes: npt.NDArray[np.void],
         numbers: Times,
-        packet_ns: Times,
+        begins_ns: Times,
         revolution: npt.NDArray[np.int64],
     ) -> None:
-        """Add the points of a piece: the estimate's, the floor's, the true echoes and their numbers."""
+        """Add the points of a piece: the estimate's, the floor's, the true echoes and their numbers, the revolutions and their begins."""
         self._of_floor += len(floor)
         if not len(placed) or not len(floor) or not len(echoes):
             self._unmatched += len(placed)
             return
         at, of_floor, of_echo = _matched(self._numbers(placed), self._numbers(floor), numbers)
-        same = np.abs(placed.range_steps[at] * RANGE_LSB_M - echoes["range_m"][of_echo]) < SAME_ECHO_M
+        same = np.abs(placed["range"][at] - echoes["range_m"][of_echo]) < SAME_ECHO_M
         at, of_floor, of_echo = at[same], of_floor[same], of_echo[same]
         self._unmatched += len(placed) - len(at)
         if not len(at):
@@ -270,16 +275,16 @@ class _Sums:
         keys = patches.patch_keys(hits[wall], normals[wall], surface[wall])
         self._facades(keys, hits[wall], found[wall], best[wall], time_ns[wall])
         level = np.flatnonzero(pure & (normals[:, 2] > LEVEL))
-        packet = np.clip(np.searchsorted(packet_ns, time_ns[level], side="right") - 1, 0, len(packet_ns) - 1)
+        turn = np.clip(np.searchsorted(begins_ns, time_ns[level], side="right") - 1, 0, len(begins_ns) - 1)
         heights = np.stack([found[level, 2], best[level, 2]], axis=1)
-        self._ground.add(cell_keys(hits[level], surface[level]), heights, revolution[packet], time_ns[level])
+        self._ground.add(cell_keys(hits[level], surface[level]), heights, revolution[turn], time_ns[level])
         if self._section is not None:
             inside = self._section.holds(hits)
             self._slices.append((self._section.coordinates(found[inside]), time_ns[inside]))
 
     def _numbers(self, points: Points) -> Times:
-        rank = (points.returns & 0x0F).astype(np.int64) - 1
-        return shot_numbers(points.time_ns, points.laser, rank, self._start_ns)
+        rank = points["return_number"].astype(np.int64) - 1
+        return shot_numbers(points.time_ns, points["laser"], rank, self._start_ns)
 
     def _points(self, hits: Array, found: Array, best: Array, time_ns: int) -> None:
         square = np.stack([np.square(points - hits).sum(axis=1) for points in (found, best)], axis=1)

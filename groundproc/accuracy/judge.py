@@ -15,7 +15,7 @@ from groundproc.accuracy import poses
 from groundproc.accuracy.alignment import align
 from groundproc.accuracy.cloud import CloudErrors, Section, judge_cloud
 from groundproc.accuracy.truth import Truth
-from groundproc.sensors.hdl32e import LaserTable
+from groundproc.sensors.shots import LaserTable
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

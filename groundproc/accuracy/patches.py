@@ -73,11 +73,6 @@ class Moments:
         """Of each group, shape (groups,)."""
         return np.fromiter(self._rows, np.int64, len(self._rows))
 
-    @property
-    def centres_m(self) -> Array:
-        """The point of each group that its moments are about, shape (groups, 3)."""
-        return self._centres[: len(self)]
-
     def add(self, keys: Keys, reference_m: Array, *sets: Array) -> None:
         """Add points to their groups.
 

@@ -18,8 +18,8 @@ from numba import njit
 from flightlog import config
 from flightlog.constants import HOUR_NS
 from flightlog.errors import LogError
-from flightlog.hdl32e import FIRING_NS, LASER_NS, LASERS
 from flightlog.mount import Mount
+from groundproc import sensors
 from groundproc.flight.timeline import Line
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.table import read_trajectory
@@ -171,16 +171,19 @@ def shot_numbers(
         Lidar time of the flight's first shot.
     """
     numbers = np.empty(len(time_ns), np.int64)
-    _number(time_ns, laser, rank, start_ns, numbers)
+    lidar = sensors.lidar(sensors.FLOWN)  # which is what the simulator simulates
+    _number(time_ns, laser, rank, start_ns, len(lidar.lasers), lidar.firing_ns, lidar.laser_ns, numbers)
     return numbers
 
 
 @njit(cache=True, nogil=True)
-def _number(time_ns: Any, laser: Any, rank: Any, start_ns: int, out: Any) -> None:
+def _number(
+    time_ns: Any, laser: Any, rank: Any, start_ns: int, lasers: int, firing_ns: int, laser_ns: int, out: Any
+) -> None:
     for i in range(len(time_ns)):
-        late_ns = time_ns[i] - start_ns - np.int64(laser[i]) * LASER_NS
-        firing = (late_ns + FIRING_NS // 2) // FIRING_NS
-        out[i] = (firing * LASERS + np.int64(laser[i])) * 2 + np.int64(rank[i])
+        late_ns = time_ns[i] - start_ns - np.int64(laser[i]) * laser_ns
+        firing = (late_ns + firing_ns // 2) // firing_ns
+        out[i] = (firing * lasers + np.int64(laser[i])) * 2 + np.int64(rank[i])
 
 
 class Hits:

@@ -1,8 +1,8 @@
-"""Shots and poses to points in the world: the source's equation, one pose for each firing.
+"""Shots and poses to points in the world: the source's equation, each shot with the pose of its own instant.
 
     p_ins = mat_ins_lidar p_lidar + lever arm;    p_local = mat_local_ins p_ins + position            (spec of the source, steps 1-3)
 
-in column form. One fused kernel goes from packet bytes to local coordinates; a second puts them into a projected CRS.
+in column form. `project` puts local coordinates into a projected CRS.
 """
 
 from typing import Any, Final
@@ -11,74 +11,70 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog import hdl32e
-from flightlog.hdl32e import BLOCKS, FIRING_NS, LASER_NS, LASERS, RANGE_LSB_M
 from flightlog.mount import Mount
 from groundproc.cloud.points import Dropped, Points
 from groundproc.geodesy import Polynomial
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors.hdl32e import Gate, LaserTable
+from groundproc.sensors.shots import Shots
 from groundproc.trajectory.trajectory import HOLD, Trajectory
 
 Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
 
-MID_FIRING_NS: Final = (LASERS - 1) * LASER_NS // 2
-"""From a firing's first laser to its middle [ns]: the instant whose pose all 32 share. At 50 deg/s and 50 m it is right to 0.8 mm."""
+STRETCH_NS: Final = 500_000
+"""Within so long a stretch [ns] the pose is interpolated linearly between its ends. That is right to h^2/8 times the second derivative:
+at 10 m/s^2 and 1000 deg/s^2 to 3e-7 m and 5e-7 rad; the chord of a turn at 300 deg/s shortens a vector by 9e-7 of its length."""
+_PIECE: Final = 1 << 16
+"""Shots for which every pose is asked at once: bounds the memory."""
 
-_BLOCK_BYTES: Final = hdl32e.BLOCK_DTYPE.itemsize
 
-
-def georeference(
-    packets: npt.NDArray[np.void],
-    time_ns: npt.NDArray[np.int64],
-    trajectory: Trajectory,
-    mount: Mount,
-    gate: Gate | None = None,
-    lasers: LaserTable | None = None,
-) -> Points:
-    """Place the returns of data packets in the trajectory's local frame.
+def georeference(shots: Shots, trajectory: Trajectory, mount: Mount) -> Points:
+    """Place shots in the trajectory's local frame.
 
     Parameters
     ----------
-    packets : ndarray of SCAN_PACKET_DTYPE or DATA_DTYPE, shape (n,)
-        All of one return mode.
-    time_ns : ndarray of int64, shape (n,)
-        Time of each packet's stamp on the trajectory's scale [ns].
+    shots : Shots
+        With times on the trajectory's scale [ns].
     trajectory : Trajectory
     mount : Mount
-    gate : Gate, optional
-        Default: every return.
-    lasers : LaserTable, optional
-        Default: the manual's.
+
+    Returns
+    -------
+    Points
+        Those that the trajectory covers.
     """
-    data = packets["data"] if packets.dtype.names and "data" in packets.dtype.names else packets
-    (raw, head), dual = decode.raw_bytes(packets), decode.is_dual(data)
-    lasers = lasers or LaserTable.nominal()
-    sensor, covered = sensor_poses(time_ns, BLOCKS // 2 if dual else BLOCKS, trajectory, mount)
-    size = len(raw) * BLOCKS * LASERS
-    out = (
-        np.empty(size, np.int64),
-        np.empty((size, 3)),
-        np.empty(size, np.uint16),
-        np.empty(size, np.uint8),
-        np.empty(size, np.uint8),
-        np.empty(size, np.uint8),
-    )
-    table = np.stack([np.cos(lasers.elevation_rad), np.sin(lasers.elevation_rad), lasers.range_offset_m])
-    limits = (gate or Gate()).steps()
-    place = _place_dual if dual else _place_single
-    counters = np.zeros(4, np.int64)
-    count = place(raw, head, time_ns, table, *limits, covered, sensor, out, counters)
-    stamps, xyz, ranges, intensity, laser, returns = out
-    return Points(
-        stamps[:count],
-        xyz[:count],
-        ranges[:count],
-        intensity[:count],
-        laser[:count],
-        returns[:count],
-        Dropped(*counters.tolist()),
-    )
+    xyz = np.empty((len(shots), 3))
+    if trajectory.interpolation == HOLD:
+        covered = _place_each(shots, trajectory, mount, xyz, np.arange(len(shots)))
+    else:
+        covered = _place_stretches(shots, trajectory, mount, xyz)
+    missing = len(shots) - int(np.count_nonzero(covered))
+    kept, xyz = (shots[covered], xyz[covered]) if missing else (shots, xyz)
+    gated = shots.gated
+    dropped = Dropped(missing, gated.outside_fov, gated.no_return, gated.out_of_range)
+    columns = {
+        "intensity": kept.intensity,
+        "return_number": kept.returns & 0x0F,
+        "number_of_returns": kept.returns >> 4,
+        "laser": kept.laser,
+        "range": kept.range_m,
+    }
+    return Points(kept.time_ns, xyz, columns, dropped)
+
+
+def sensor_poses(time_ns: Times, trajectory: Trajectory, mount: Mount) -> tuple[Array, Mask]:
+    """Poses of the sensor at times, shape (n,).
+
+    Returns
+    -------
+    poses : ndarray, shape (n, 12)
+        Rows of the matrix "local from sensor", then the position [m].
+    covered : ndarray of bool, shape (n,)
+    """
+    poses, covered = trajectory.where_covered(time_ns)
+    out = np.empty((len(time_ns), 12))
+    _sensor_poses(poses.position_m, poses.quat_local_ins_wxyz, mount.mat_ins_lidar(), mount.lidar_position_m(), out)
+    return out, covered
 
 
 def project(xyz_m: Array, polynomial: Polynomial) -> None:
@@ -86,40 +82,54 @@ def project(xyz_m: Array, polynomial: Polynomial) -> None:
     _project(xyz_m, polynomial.centre_m, polynomial.coefficients)
 
 
-def sensor_poses(
-    time_ns: npt.NDArray[np.int64], firings: int, trajectory: Trajectory, mount: Mount
-) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Pose of the sensor at the middle of each firing.
+def _place_stretches(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array) -> Mask:
+    """Place shots with poses interpolated linearly within stretches; those at an edge of the coverage each with its own."""
+    first, slot = _stretches(shots.time_ns, STRETCH_NS)
+    poses, known = sensor_poses((slot[:, None] + np.array([0, 1])).ravel() * STRETCH_NS, trajectory, mount)
+    whole = known.reshape(-1, 2).all(axis=1)
+    _place(shots.time_ns, shots.xyz_m, first, slot, whole, poses.reshape(-1, 2, 12), STRETCH_NS, xyz)
+    covered = np.ones(len(shots), np.bool_)
+    if not whole.all():
+        edge = np.flatnonzero(~np.repeat(whole, np.diff(first)))
+        covered[edge] = _place_each(shots, trajectory, mount, xyz, edge)
+    return covered
 
-    The trajectory is asked at the first and the last firing of each packet, and what lies between, half a millisecond, is filled
-    linearly: at 1000 deg/s^2 and 10 m/s^2 that is right to 1e-6 rad and 1e-6 m. A held pose grid is asked for every firing.
 
-    Parameters
-    ----------
-    time_ns : ndarray of int64, shape (n,)
-        Stamps of the packets [ns] on the trajectory's scale.
-    firings : int
-        In a packet.
-    trajectory, mount
+def _place_each(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array, chosen: Times) -> Mask:
+    """Place chosen shots, shape (n,), each with a pose asked for; which of them are covered."""
+    covered = np.zeros(len(chosen), np.bool_)
+    for start in range(0, len(chosen), _PIECE):
+        some = chosen[start : start + _PIECE]
+        poses, known = sensor_poses(shots.time_ns[some], trajectory, mount)
+        covered[start : start + _PIECE] = known
+        # poses outside the trajectory are no numbers to reckon with
+        some, poses = some[known], poses[known]
+        mats = poses[:, :9].reshape(-1, 3, 3)
+        xyz[some] = np.einsum("nij,nj->ni", mats, shots.xyz_m[some].astype(np.float64)) + poses[:, 9:]
+    return covered
 
-    Returns
-    -------
-    poses : ndarray, shape (n * firings, 12)
-        Rows of the matrix "local from sensor", then the position [m].
-    covered : ndarray of bool, shape (n * firings,)
+
+@njit(cache=True, nogil=True)
+def _stretches(time_ns: Any, length_ns: int) -> Any:
+    """Cut times where they pass from one stretch to another.
+
+    Returns the first shot of each run, and the end, shape (m + 1,); and the number of its stretch, counted from time 0, shape (m,).
     """
-    asked = np.arange(firings) if trajectory.interpolation == HOLD else np.array([0, firings - 1])
-    times = (time_ns[:, None] + asked * FIRING_NS + MID_FIRING_NS).ravel()
-    poses, known = trajectory.where_covered(times)
-    at_asked = np.empty((len(times), 12))
-    _sensor_poses(
-        poses.position_m, poses.quat_local_ins_wxyz, mount.mat_ins_lidar(), mount.lidar_position_m(), at_asked
-    )
-    if len(asked) == firings:
-        return at_asked, known
-    out, covered = np.empty((len(time_ns) * firings, 12)), np.empty(len(time_ns) * firings, np.bool_)
-    _fill(at_asked, known, firings, out, covered)
-    return out, covered
+    many = len(time_ns)
+    first, slot = (
+        np.empty(many + 1, np.int64),
+        np.empty(many, np.int64),
+    )  # as long as can be: pages never touched cost nothing
+    count, start, end = 0, np.int64(0), np.int64(0)
+    for i in range(many):
+        if not start <= time_ns[i] < end:
+            number = time_ns[i] // length_ns
+            start = number * length_ns
+            end = start + length_ns
+            first[count], slot[count] = i, number
+            count += 1
+    first[count] = many
+    return first[: count + 1].copy(), slot[:count].copy()
 
 
 @njit(cache=True, nogil=True)
@@ -142,146 +152,28 @@ def _sensor_poses(position: Any, quat: Any, mat_ins_lidar: Any, lever: Any, out:
             pose[9 + row] = position[i, row] + a * lever[0] + b * lever[1] + c * lever[2]
 
 
-@njit(cache=True, nogil=True)
-def _fill(ends: Any, known: Any, firings: int, out: Any, covered: Any) -> None:
-    """Poses between the first and the last firing of each packet."""
-    for packet in range(len(ends) // 2):
-        both = known[2 * packet] and known[2 * packet + 1]
-        for firing in range(firings):
-            covered[packet * firings + firing] = both
-            if both:
-                part = firing / (firings - 1)
-                for i in range(12):
-                    out[packet * firings + firing, i] = (1 - part) * ends[2 * packet, i] + part * ends[
-                        2 * packet + 1, i
-                    ]
-
-
-@njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _axes(pose: Any, azimuth: float) -> Any:
-    """For x, y and z of the world: the sensor's forward and right turned to a block's azimuth, its up, its position."""
-    cosine, sine = np.cos(azimuth * decode.STEP_RAD), np.sin(azimuth * decode.STEP_RAD)
-    fx, rx = pose[0] * sine + pose[1] * cosine, pose[0] * cosine - pose[1] * sine
-    fy, ry = pose[3] * sine + pose[4] * cosine, pose[3] * cosine - pose[4] * sine
-    fz, rz = pose[6] * sine + pose[7] * cosine, pose[6] * cosine - pose[7] * sine
-    return fx, rx, pose[2], pose[9], fy, ry, pose[5], pose[10], fz, rz, pose[8], pose[11]
-
-
 @njit(cache=True, nogil=True, fastmath=True)
-def _place_single(
-    raw: Any,
-    head: int,
-    time_ns: Any,
-    lasers: Any,
-    start: float,
-    width: float,
-    low: int,
-    high: int,
-    covered: Any,
-    sensor: Any,
-    out: Any,
-    counters: Any,
-) -> int:
-    out_time, out_xyz, out_range, out_intensity, out_laser, out_returns = out
-    count = 0
-    steps, directions = np.empty(BLOCKS), np.empty((2, LASERS))
-    for packet in range(raw.shape[0]):
-        row = raw[packet, head:]
-        step = decode.azimuth_step(row, 1, steps)
-        decode.laser_directions(step, lasers, directions)
-        for block in range(BLOCKS):
-            if not covered[packet * BLOCKS + block]:
-                counters[0] += LASERS
-                continue
-            pose = sensor[packet * BLOCKS + block]
-            azimuth = float(decode.u16(row, block * _BLOCK_BYTES + 2) % 36_000)
-            if decode.block_is_outside(azimuth, step, start, width):
-                counters[1] += LASERS
-                continue
-            inside = decode.block_is_inside(azimuth, step, start, width)
-            fx, rx, ux, tx, fy, ry, uy, ty, fz, rz, uz, tz = _axes(pose, azimuth)
-            firing_ns = time_ns[packet] + block * FIRING_NS
-            at = block * _BLOCK_BYTES + 1
-            for k in range(LASERS):
-                at += 3
-                range_steps = decode.u16(row, at)
-                if not inside and (azimuth + step * decode.LASER_FRACTION * k - start) % decode.AZIMUTH_TURN > width:
-                    counters[1] += 1
-                    continue
-                if range_steps < low or range_steps > high:
-                    counters[2 if range_steps == 0 else 3] += 1
-                    continue
-                distance = range_steps * RANGE_LSB_M + lasers[2, k]
-                p, q, r = distance * directions[0, k], distance * directions[1, k], distance * lasers[1, k]
-                out_time[count] = firing_ns + k * LASER_NS
-                out_xyz[count, 0] = tx + p * fx + q * rx + r * ux
-                out_xyz[count, 1] = ty + p * fy + q * ry + r * uy
-                out_xyz[count, 2] = tz + p * fz + q * rz + r * uz
-                out_range[count] = range_steps
-                out_intensity[count] = row[at + 2]
-                out_laser[count] = k
-                count += 1
-    out_returns[:count] = decode.SINGLE_RETURN
-    return count
-
-
-@njit(cache=True, nogil=True, fastmath=True)
-def _place_dual(
-    raw: Any,
-    head: int,
-    time_ns: Any,
-    lasers: Any,
-    start: float,
-    width: float,
-    low: int,
-    high: int,
-    covered: Any,
-    sensor: Any,
-    out: Any,
-    counters: Any,
-) -> int:
-    out_time, out_xyz, out_range, out_intensity, out_laser, out_returns = out
-    count = 0
-    steps, directions = np.empty(BLOCKS), np.empty((2, LASERS))
-    for packet in range(raw.shape[0]):
-        row = raw[packet, head:]
-        step = decode.azimuth_step(row, 2, steps)
-        decode.laser_directions(step, lasers, directions)
-        for firing in range(BLOCKS // 2):
-            if not covered[packet * (BLOCKS // 2) + firing]:
-                counters[0] += LASERS
-                continue
-            pose = sensor[packet * (BLOCKS // 2) + firing]
-            azimuth = float(decode.u16(row, 2 * firing * _BLOCK_BYTES + 2) % 36_000)
-            if decode.block_is_outside(azimuth, step, start, width):
-                counters[1] += LASERS
-                continue
-            inside = decode.block_is_inside(azimuth, step, start, width)
-            fx, rx, ux, tx, fy, ry, uy, ty, fz, rz, uz, tz = _axes(pose, azimuth)
-            firing_ns = time_ns[packet] + firing * FIRING_NS
-            for k in range(LASERS):
-                if not inside and (azimuth + step * decode.LASER_FRACTION * k - start) % decode.AZIMUTH_TURN > width:
-                    counters[1] += 1
-                    continue
-                last = 2 * firing * _BLOCK_BYTES + 4 + 3 * k
-                first, second, returns = decode.pair_returns(row, last, last + _BLOCK_BYTES, low, high)
-                if returns == 0:
-                    counters[3 if row[last] or row[last + 1] else 2] += 1
-                for number in range(returns):
-                    at = first if number == 0 else second
-                    range_steps = decode.u16(row, at)
-                    distance = range_steps * RANGE_LSB_M + lasers[2, k]
-                    p, q, r = distance * directions[0, k], distance * directions[1, k], distance * lasers[1, k]
-                    out_time[count] = firing_ns + k * LASER_NS
-                    out_xyz[count, 0] = tx + p * fx + q * rx + r * ux
-                    out_xyz[count, 1] = ty + p * fy + q * ry + r * uy
-                    out_xyz[count, 2] = tz + p * fz + q * rz + r * uz
-                    out_range[count] = range_steps
-                    out_intensity[count] = row[at + 2]
-                    out_laser[count] = k
-                    out_returns[count] = decode.SINGLE_RETURN if returns == 1 else decode.FIRST_OF_TWO + number
-                    count += 1
-    return count
+def _place(time_ns: Any, xyz: Any, first: Any, slot: Any, whole: Any, ends: Any, length_ns: int, out: Any) -> None:
+    """Place the shots of whole stretches: (a + u b) applied to each, u the time since the stretch began."""
+    per_ns = 1.0 / length_ns
+    for run in range(len(slot)):
+        if not whole[run]:
+            continue
+        begin_ns = slot[run] * length_ns
+        p, b = ends[run, 0], (ends[run, 1] - ends[run, 0]) * per_ns
+        # scalars and slices: the compiler then knows that no store changes them and that no index is negative
+        a0, a1, a2, a3, a4, a5 = p[0], p[1], p[2], p[3], p[4], p[5]
+        a6, a7, a8, a9, a10, a11 = p[6], p[7], p[8], p[9], p[10], p[11]
+        b0, b1, b2, b3, b4, b5 = b[0], b[1], b[2], b[3], b[4], b[5]
+        b6, b7, b8, b9, b10, b11 = b[6], b[7], b[8], b[9], b[10], b[11]
+        span = slice(first[run], first[run + 1])
+        times, sensor, world = time_ns[span], xyz[span], out[span]
+        for i in range(len(times)):
+            u = np.float64(np.int32(times[i] - begin_ns))
+            x, y, z = np.float64(sensor[i, 0]), np.float64(sensor[i, 1]), np.float64(sensor[i, 2])
+            world[i, 0] = a0 * x + a1 * y + a2 * z + a9 + u * (b0 * x + b1 * y + b2 * z + b9)
+            world[i, 1] = a3 * x + a4 * y + a5 * z + a10 + u * (b3 * x + b4 * y + b5 * z + b10)
+            world[i, 2] = a6 * x + a7 * y + a8 * z + a11 + u * (b6 * x + b7 * y + b8 * z + b11)
 
 
 @njit(cache=True, nogil=True, fastmath=True)

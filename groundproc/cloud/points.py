@@ -1,40 +1,17 @@
 """Points: returns placed in the world, and what became of the shots that made none."""
 
-from dataclasses import astuple, dataclass
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from flightlog.errors import UsageError
+from groundproc.cloud.dimensions import dimension
+
 Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Points:
-    """Returns placed in the world, in the order they were received.
-
-    Attributes
-    ----------
-    time_ns : ndarray of int64, shape (n,)
-        On the trajectory's scale, UTC.
-    xyz_m : ndarray, shape (n, 3)
-        Local (east, north, up), or easting, northing, height after `project`.
-    range_steps : ndarray of uint16, shape (n,)
-        Range as measured [2 mm].
-    intensity, laser, returns : ndarray of uint8, shape (n,)
-        As in `decode.Shots`.
-    dropped : Dropped
-    """
-
-    time_ns: npt.NDArray[np.int64]
-    xyz_m: Array
-    range_steps: npt.NDArray[np.uint16]
-    intensity: npt.NDArray[np.uint8]
-    laser: npt.NDArray[np.uint8]
-    returns: npt.NDArray[np.uint8]
-    dropped: "Dropped"
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
+Column = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +21,7 @@ class Dropped:
     Attributes
     ----------
     no_pose : int
-        The trajectory does not cover their firing.
+        Returns within field of view and range gate that the trajectory does not cover.
     outside_fov : int
     no_return : int
     out_of_range : int
@@ -58,3 +35,63 @@ class Dropped:
 
     def __add__(self, other: "Dropped") -> "Dropped":
         return Dropped(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Returns placed in the world, in the order they were received.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+        UTC; on the sensor's own scale where that is tied to nothing.
+    xyz_m : ndarray, shape (n, 3)
+        Local (east, north, up); easting, northing, height once projected; right, ahead, up in the sensor's frame.
+    columns : mapping of str to ndarray, shape (n,)
+        By names of `dimensions.TABLE`, values in the units given there. `points["range"]` is one of them.
+    dropped : Dropped
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    xyz_m: Array
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    dropped: Dropped = field(default_factory=Dropped)
+
+    def __post_init__(self) -> None:
+        assert self.xyz_m.shape == (len(self.time_ns), 3), self.xyz_m.shape
+        for name, values in self.columns.items():
+            entry = dimension(name)
+            assert values.shape == (len(self.time_ns),), (name, values.shape)
+            assert entry.holds(values), f"{name}: {values.dtype} found, expected {entry.column}"
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> Column:
+        """A column.
+
+        Raises
+        ------
+        UsageError
+            These points have none of that name.
+        """
+        try:
+            return self.columns[name]
+        except KeyError:
+            entry = dimension(name)
+            had = ", ".join(self.columns) or "no attributes"
+            raise UsageError(
+                f"{name} ({entry.brief}) found in none of the points, which have {had}; {entry.source} fills it"
+            ) from None
+
+    def masked(self, where: npt.NDArray[Any] | slice) -> "Points":
+        """Some of the points: a mask, numbers or a slice. What was dropped stays as it is."""
+        columns = {name: values[where] for name, values in self.columns.items()}
+        return replace(self, time_ns=self.time_ns[where], xyz_m=self.xyz_m[where], columns=columns)
+
+    def with_columns(self, **columns: Column) -> "Points":
+        """The points with more columns, or with others in their place."""
+        return replace(self, columns={**self.columns, **columns})

@@ -44,6 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.estimation.calibration.compass import write_compass
     from groundproc.estimation.calibration.mount import calibrate
     from groundproc.files import made_folder, written_aside
+    from groundproc.flight.lidar import lidar_of
     from groundproc.flight.mounting import find_mount
     from groundproc.products.laser_plot import draw_lasers
     from groundproc.progress import stages
@@ -54,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("a log is named twice; its flight would count twice")
     with LogReader(logs[0]) as reader:
         nominal, _ = find_mount(str(arguments.mount) if arguments.mount else None, [reader])
+        lasers = lidar_of([reader]).lasers
     flights: list[FlightResult] = []
     with stages(logs, {"read": "clocks and autopilots", "adjust": "flights"}) as progress:
         for path in logs:
@@ -66,8 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
         if result.compass_found:
             write_compass(arguments.output / "compass.yaml", result.compass, _compass_head(result))
         if result.lasers is not None:
-            write_lasers(arguments.output / "lasers.yaml", result.lasers.file(), _lasers_head(result))
-            draw_lasers(arguments.output / "lasers.png", result.lasers)
+            write_lasers(arguments.output / "lasers.yaml", result.lasers.file(len(lasers)), _lasers_head(result))
+            with written_aside(arguments.output / "lasers.png") as aside:
+                draw_lasers(result.lasers.figures(lasers)).savefig(aside, format="png")
         with written_aside(arguments.output / "calibration.json") as aside:
             aside.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(report, indent=2) if arguments.json else _text(report, arguments.output))
@@ -87,8 +90,8 @@ def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> Fli
     from flightlog.logfile import LogReader
     from groundproc.estimation.adjustment import adjusted
     from groundproc.estimation.calibration.mount import COMPASS, SHARED, flight_result
+    from groundproc.estimation.direct import ins_estimate
     from groundproc.estimation.method import gather
-    from groundproc.estimation.methods import ins_estimate
     from groundproc.flight.flight import read_flight
     from groundproc.flight.timeline import legs
     from groundproc.sensors.lasers import ESTIMATE

@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.commands.values import field_of_view
     from groundproc.products.sensor_cloud import write_sensor_cloud
     from groundproc.progress import stages
-    from groundproc.sensors.hdl32e import Gate
+    from groundproc.sensors.shots import Gate
 
     if not 0.0 <= arguments.min_range <= arguments.max_range:
         raise UsageError(

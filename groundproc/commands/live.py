@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import FrameType
 
     from flightlog.mount import Mount
@@ -73,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.live.session import Session
     from groundproc.live.voxelcloud import VoxelCloud
     from groundproc.live.warmup import warm_up
+    from groundproc.progress import compiling
 
     for name, least in (("points", 10_000), ("port", 0), ("duration", 0), ("idle", 0)):
         value = getattr(arguments, name)
@@ -96,7 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
                 timer = threading.Timer(arguments.duration or 0.0, over.set)
                 timer.daemon = True
                 try:
-                    warm_up()
+                    with compiling(_say_once()):
+                        warm_up()
                     source.start()
                     print(
                         "listening" if arguments.follow is None else f"following {arguments.follow}",
@@ -123,10 +126,23 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _say_once() -> Callable[[bool], None]:
+    """Says, once, that the start waits for the compiler."""
+    said = False
+
+    def say(begins: bool) -> None:
+        nonlocal said
+        if begins and not said:
+            print("compiling (first use; swath warmup does it beforehand)", file=sys.stderr, flush=True)
+        said = True
+
+    return say
+
+
 def _options(arguments: argparse.Namespace) -> Any:
     from groundproc.commands.values import field_of_view
     from groundproc.live.estimator import Options
-    from groundproc.sensors.hdl32e import Gate
+    from groundproc.sensors.shots import Gate
 
     fov = field_of_view(arguments.fov) if arguments.fov else (255.0, 105.0)
     patience_ns = 400_000_000 if arguments.follow is None else 2_000_000_000

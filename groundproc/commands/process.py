@@ -3,122 +3,135 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from groundproc.survey import Survey
+    from collections.abc import Sequence
+
+    from groundproc.steps.process import State
+    from groundproc.steps.request import Request
 
 HELP = "make a georeferenced cloud of a flight: cloud.laz, trajectory.csv, quality.json, pictures"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a flight log, or all parts of one flight")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the products")
+    from groundproc.commands.options import add_settings
+    from groundproc.steps import ORDER
+    from groundproc.survey import SECTIONS
+
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        type=Path,
+        metavar="LOG",
+        help="a flight log, or all parts of one flight; or a folder of products, to go on with it as it was made",
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder of the products")
     parser.add_argument("--config", type=Path, metavar="FILE", help="survey.yaml; options here go before it")
-    parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml, in place of the one in the log")
+    add_settings(parser, SECTIONS)
     parser.add_argument(
-        "--method",
-        choices=("best", "adjusted", "filtered", "dynamic", "ins"),
-        help="how the trajectory is made; default: best, which is adjusted, or filtered or ins where the log does not hold what that needs",
-    )
-    parser.add_argument(
-        "--causal", action="store_true", default=None, help="adjusted: use nothing of the future, as in flight"
-    )
-    parser.add_argument(
-        "--crs",
-        "--epsg",
-        metavar="EPSG",
-        help="output CRS, such as 32633 or EPSG:32633; default: UTM zone of the first fix",
-    )
-    parser.add_argument(
-        "--height", choices=("msl", "ellipsoid", "relative"), help="what heights refer to; default: msl"
-    )
-    parser.add_argument("--geoid", metavar="N", help="geoid above the ellipsoid: a number [m] or a PROJ grid file")
-    parser.add_argument(
-        "--pose-grid",
-        metavar="MS",
-        help="method ins: one pose for so long, such as 10ms; default: one for every firing",
-    )
-    parser.add_argument("--sync", choices=("auto", "gyro", "host"), help="how the clocks are tied; default: auto")
-    parser.add_argument("--fov", metavar="A-B", help="azimuths kept, clockwise, in degrees, or all; default: 255-105")
-    parser.add_argument(
-        "--positions",
+        "--trajectory",
         type=Path,
-        metavar="FILE",
-        help="a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv), for methods adjusted and filtered",
+        metavar="DIR|CSV",
+        help="a trajectory made before: a folder of `swath process`, whose mount, lasers and clocks are used too, or a trajectory.csv",
     )
+    parser.add_argument("--until", choices=ORDER, metavar="STEP", help=f"stop after this step: {', '.join(ORDER)}")
+    parser.add_argument("--status", action="store_true", help="say what is there and what is to be done, and why")
     parser.add_argument(
-        "--control",
-        type=Path,
-        metavar="CSV",
-        help="control points and planes for method adjusted: columns x, y, z, sigma, and more",
-    )
-    parser.add_argument("--compass", type=Path, metavar="FILE", help="compass model that method dynamic begins with")
-    parser.add_argument(
-        "--lasers",
-        metavar="FILE",
-        help="corrections of the single lasers, as `swath calibrate --lasers` writes them; or estimate, to have method adjusted find them",
-    )
-    parser.add_argument(
-        "--trajectory", type=Path, metavar="CSV", help="poses from elsewhere, in place of the autopilot's"
+        "--force", action="store_true", help="do every step again, and write over files that are not ours"
     )
     parser.add_argument("--json", action="store_true", help="print what quality.json holds")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Process, with a progress bar on a terminal."""
+    """Process what is to be done, with a progress bar on a terminal."""
     from groundproc.progress import stages
-    from groundproc.steps.pipeline import process
+    from groundproc.steps import ORDER
+    from groundproc.steps.process import process
 
-    survey = _survey(arguments)
-    with stages(
-        arguments.logs, {"read": "clocks and autopilot", "adjust": "trajectory", "place": "points"}
-    ) as progress:
-        quality = process(arguments.logs, survey, arguments.output, progress, arguments.trajectory)
-    if arguments.json:
-        import json
-
-        print(json.dumps(quality, indent=2))
-    else:
-        print(_report(quality, arguments.output))
+    request, folder = _request(arguments)
+    if arguments.status:
+        return _status(request, folder, arguments.json)
+    until = arguments.until or ORDER[-1]
+    names = {"read": "clocks and autopilot", "adjust": "trajectory", "place": "points"}
+    try:
+        with stages(request.logs, names) as progress:
+            found = process(request, folder, progress, until=until, force=arguments.force)
+    except KeyboardInterrupt:
+        print(f"swath: interrupted; the same command goes on after the last finished step of {folder}", file=sys.stderr)
+        raise
+    if until != ORDER[-1]:
+        _print_states(found, folder, arguments.json)
+        return 0
+    quality = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
+    print(json.dumps(quality, indent=2) if arguments.json else _report(quality, folder))
     if quality["trajectory"]["warning"]:
         print(f"swath: {quality['trajectory']['warning']}", file=sys.stderr)
         return 1
     return 0
 
 
-def _survey(arguments: argparse.Namespace) -> Survey:
-    """The survey file with the command line's options laid over it."""
-    from flightlog import config
-    from groundproc.commands.values import field_of_view, milliseconds
-    from groundproc.sensors.lasers import ESTIMATE
+def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
+    """What is asked for, and the folder of the products: from a folder's ledger where that is what is named."""
+    from flightlog.errors import UsageError
+    from groundproc.steps.process import remembered
+    from groundproc.steps.request import Request
     from groundproc.survey import Survey
 
-    tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else Survey())
-    if isinstance(tree["mount"], str):
-        tree["mount"] = str(arguments.config.parent / tree["mount"])
-    for name in ("compass", "positions", "control", "lasers"):
-        if tree[name] not in (None, ESTIMATE):
-            tree[name] = str(arguments.config.parent / tree[name])
-    given = {
-        "crs": arguments.crs,
-        "method": arguments.method,
-        "causal": arguments.causal,
-        "height": arguments.height,
-        "geoid": arguments.geoid,
-        "sync": arguments.sync,
-        "pose_grid_ms": arguments.pose_grid and milliseconds(arguments.pose_grid),
-        "fov_deg": arguments.fov and list(field_of_view(arguments.fov)),
-        "mount": arguments.mount and str(arguments.mount),
-        "compass": arguments.compass and str(arguments.compass),
-        "positions": arguments.positions and str(arguments.positions),
-        "lasers": arguments.lasers,
-        "control": arguments.control and str(arguments.control),
-    }
-    return config.from_mapping(tree | {k: v for k, v in given.items() if v is not None}, Survey, "command line")
+    first: Path = arguments.logs[0]
+    if arguments.output is not None:
+        return Request(arguments.logs, _survey(arguments, Survey()), arguments.trajectory), arguments.output
+    if len(arguments.logs) > 1 or not first.is_dir():
+        raise UsageError("-o DIR is missing: the folder of the products")
+    before = remembered(first)
+    if before is None:
+        raise UsageError(f"{first}: no products of `swath process` in this folder; expected LOG... -o DIR")
+    again = replace(before, survey=_survey(arguments, before.survey), poses=arguments.trajectory or before.poses)
+    return again, first
+
+
+def _survey(arguments: argparse.Namespace, otherwise: Any) -> Any:
+    """The survey file with the command line's options laid over it."""
+    from flightlog import config
+    from groundproc.commands.options import beside, given_settings
+    from groundproc.sensors.lasers import ESTIMATE
+    from groundproc.survey import FILES, SECTIONS, Survey
+
+    tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else otherwise)
+    if arguments.config:
+        beside(tree, arguments.config.parent, FILES, (ESTIMATE,))
+    return config.from_mapping(tree | given_settings(arguments, SECTIONS), Survey, "command line")
+
+
+def _status(request: Request, folder: Path, as_json: bool) -> int:
+    """What is there, what is stale, and why; touches nothing."""
+    from groundproc.steps.ledger import Ledger, open_ledger
+    from groundproc.steps.process import states
+
+    _print_states(states(request, open_ledger(folder) or Ledger(folder)), folder, as_json)
+    return 0
+
+
+def _print_states(found: Sequence[State], folder: Path, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({"folder": str(folder), "steps": [asdict(state) for state in found]}, indent=2))
+        return
+    rows = [(state.step.partition(": "), state) for state in found]
+    width = max(len(part or step) + 2 * bool(part) for (step, _, part), _ in rows) + 2
+    shown = ""
+    for (step, _, part), state in rows:
+        if part and step != shown:
+            print(step)
+        shown = step
+        when = f"{state.finished}, {state.seconds:.1f} s" if state.finished else ""
+        print(f"{'  ' + part if part else step:<{width}}{state.state:<9}{'; '.join(state.reasons) or when}")
+        if state.outputs and state.outputs != (part,):
+            print(f"{'':<{width + 9}}{', '.join(state.outputs)}")
 
 
 def _report(quality: dict[str, Any], folder: Path) -> str:
@@ -134,10 +147,31 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
         + (f"; {sync['note']}" if sync["note"] else ""),
         *_control_lines(quality.get(track["method"], {}).get("control")),
-        f"mount from {quality['mount']['source']}",
-        f"look at {folder / 'cloud_height.png'} and {folder / 'cloud_intensity.png'}; all figures are in {folder / 'quality.json'}",
+        _mount_line(quality["mount"]),
+        *_where(folder),
     ]
     return "\n".join(lines)
+
+
+def _where(folder: Path) -> list[str]:
+    """What to look at first, of what was chosen."""
+    shown = [folder / name for name in ("cloud_height.png", "cloud_intensity.png") if (folder / name).exists()]
+    parts = [f"look at {' and '.join(map(str, shown))}"] if shown else []
+    if (figures := folder / "quality.json").exists():
+        parts.append(f"all figures are in {figures}")
+    return ["; ".join(parts)] if parts else []
+
+
+def _mount_line(mount: dict[str, Any]) -> str:
+    """Which mount was used, and how well it is known where it was estimated."""
+    source, sigma = mount["source"], mount["sigma"]
+    if not source.startswith("estimated"):
+        return f"mount from {source}"
+    lidar = mount["lidar"]
+    line = (
+        f"mount {source}: yaw {lidar['yaw_deg']:.3f}, pitch {lidar['pitch_deg']:.3f}, roll {lidar['roll_deg']:.3f} deg"
+    )
+    return line + (f", sigma {max(sigma['turn_deg']):.3f} deg at most" if sigma else "")
 
 
 def _control_lines(control: dict[str, Any] | None) -> list[str]:

@@ -5,7 +5,7 @@ import math
 from flightlog.errors import UsageError
 
 
-def field_of_view(text: str) -> tuple[float, float]:
+def field_of_view(text: str, word: str = "--fov") -> tuple[float, float]:
     """Azimuths such as "255-105" or "-105:105", clockwise from first to second, or "all"; degrees."""
     if text == "all":
         return 0.0, 360.0
@@ -15,16 +15,16 @@ def field_of_view(text: str) -> tuple[float, float]:
     except ValueError:
         start = end = math.nan
     if not (-360.0 <= start <= 360.0 and -360.0 <= end <= 360.0):
-        raise UsageError(f"--fov {text!r}: expected two azimuths such as 255-105 or -105:105, in degrees, or all")
+        raise UsageError(f"{word} {text!r}: expected two azimuths such as 255-105 or -105:105, in degrees, or all")
     return start, end
 
 
-def milliseconds(text: str) -> float:
+def milliseconds(text: str, word: str = "--pose-grid") -> float:
     """A duration such as "10ms", or a plain number of milliseconds."""
     try:
         value = float(text.removesuffix("ms"))
     except ValueError:
         value = math.nan
     if not 1.0 <= value <= 1000.0:
-        raise UsageError(f"{text!r}: expected a duration of 1ms to 1000ms")
+        raise UsageError(f"{word} {text!r}: expected a duration of 1ms to 1000ms")
     return value

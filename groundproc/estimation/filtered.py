@@ -10,8 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.errors import LogError
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.inertial.readings import read
+from groundproc.estimation.inertial.solution import Solution, solve
+from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation.legs import leg_by_leg
+from groundproc.estimation.method import Given, Method, Progress
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     COMPASS,
     COURSE,
@@ -21,15 +25,13 @@ from groundproc.estimation.inertial.model import (
     GYRO_MATRIX,
     POSITION,
 )
-from groundproc.estimation.inertial.readings import read
-from groundproc.estimation.inertial.solution import Solution, solve
-from groundproc.estimation.ins import PositionFixes
-from groundproc.estimation.method import Estimate, Given, Progress
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
-from groundproc.trajectory.trajectory import Trajectory, joined
+from groundproc.trajectory.covariance import SIZE, correlation_of, mat_attitude_turn
+from groundproc.trajectory.estimate import Estimate
+from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -58,30 +60,17 @@ def filtered_estimate(given: Given, progress: Progress, outside: Sequence[Outsid
     """
     del progress
     outside = [*outside, *surveyed(given)]
-    parts: list[Trajectory] = []
     reports: list[dict[str, Any]] = []
-    reasons: list[LogError] = []
     warnings: list[str] = []
-    placed = given.placed
-    for number, (leg, fix) in enumerate(zip(placed, given.fixes, strict=True)):
-        try:
-            solution = solve_leg(given, leg, fix, outside)
-        except LogError as error:
-            reasons.append(error)
-            continue
+
+    def of_leg(leg: Leg, fixes: PositionFixes) -> Trajectory:
+        solution = solve_leg(given, leg, fixes, outside)
         reports.append({"boot": leg.boot.number, "lidar_run": leg.run} | report(solution))
-        warnings += _warnings(solution)
-        part = trajectory_in(given.frame, solution)
-        # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
-        if number and placed[number - 1].boot is leg.boot and parts:
-            part = part.after(int(parts[-1].time_ns[-1]))
-        if number + 1 < len(placed) and placed[number + 1].boot is leg.boot:
-            part = part.before(int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]))
-        if len(part) > 1:
-            parts.append(part)
-    if reasons and not parts:
-        raise reasons[0]
-    return Estimate(joined(parts), given.mount, SIGMA_SOURCE, report={"legs": reports}, warning="; ".join(warnings))
+        warnings.extend(_warnings(solution))
+        return trajectory_in(given.frame, solution)
+
+    trajectory = leg_by_leg(given, of_leg)
+    return Estimate(trajectory, given.mount, SIGMA_SOURCE, report={"legs": reports}, warning="; ".join(warnings))
 
 
 def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[OutsideFixes] = ()) -> Solution:
@@ -105,14 +94,16 @@ def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[Ou
         mat_ins_lidar=leg.sync.mat_ins_lidar,
         outside=outside,
     )
-    return solve(readings)
+    return solve(readings, given=given, leg=leg)
 
 
 def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
-    """The trajectory of a solution, with its sigmas; `frame` is that of its readings."""
-    position, attitude = sigmas(solution)
+    """The trajectory of a solution, with the covariance of its poses; `frame` is that of its readings."""
+    covariance = pose_covariance(solution)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     kept_s = (solution.kept_ns - solution.time_ns[0]) * 1e-9
     nodes_s = (solution.time_ns - solution.time_ns[0]) * 1e-9
+    at_nodes = np.stack([np.interp(nodes_s, kept_s, column) for column in sigma.T], axis=1)
     return Trajectory(
         frame=frame,
         time_ns=solution.time_ns,
@@ -120,33 +111,23 @@ def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
         velocity_m_s=solution.velocity_m_s,
         quat_local_ins_wxyz=solution.quat,
         rate_rad_s=solution.rate_rad_s,
-        sigma_position_m=np.stack([np.interp(nodes_s, kept_s, axis) for axis in position.T], axis=1),
-        sigma_attitude_rad=np.stack([np.interp(nodes_s, kept_s, axis) for axis in attitude.T], axis=1),
+        sigma_position_m=at_nodes[:, :3],
+        sigma_attitude_rad=at_nodes[:, 3:],
         covered=solution.covered,
+        correlation=correlation_of(solution.kept_ns, covariance),
     )
 
 
-def sigmas(solution: Solution) -> tuple[Array, Array]:
-    """Sigma east, north, up [m] and of roll, pitch, heading [rad] at the kept times, shape (k, 3) each."""
-    covariance = solution.covariance
-    place = slice(POSITION, POSITION + 3)
-    position = np.sqrt(np.diagonal(covariance[:, place, place], axis1=1, axis2=2).astype(np.float64))
-    turn = slice(ATTITUDE, ATTITUDE + 3)
+def pose_covariance(solution: Solution) -> Array:
+    """Covariance of east, north, up [m], roll, pitch, heading [rad] at the kept times, shape (k, 6, 6)."""
     row = np.searchsorted(solution.time_ns, solution.kept_ns)
     heading, pitch, _ = frames.attitude_of(frames.mat_from_quat(solution.quat[row]))
+    states = np.r_[POSITION : POSITION + 3, ATTITUDE : ATTITUDE + 3]
+    covariance = solution.covariance[:, states[:, None], states].astype(np.float64)
     # a small turn in the local frame as changes of roll, pitch, heading
-    sine, cosine, tangent, secant = np.sin(heading), np.cos(heading), np.tan(pitch), 1.0 / np.cos(pitch)
-    zero, one = np.zeros_like(sine), np.ones_like(sine)
-    turned = np.stack(
-        [
-            np.stack([sine * secant, cosine * secant, zero], axis=1),
-            np.stack([cosine, -sine, zero], axis=1),
-            np.stack([sine * tangent, cosine * tangent, -one], axis=1),
-        ],
-        axis=1,
-    )
-    spread = turned @ covariance[:, turn, turn].astype(np.float64) @ np.swapaxes(turned, 1, 2)
-    return position, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    to_angles = np.tile(np.eye(SIZE), (len(row), 1, 1))
+    to_angles[:, 3:, 3:] = mat_attitude_turn(heading, pitch)
+    return np.asarray(to_angles @ covariance @ np.swapaxes(to_angles, 1, 2))
 
 
 def report(solution: Solution) -> dict[str, Any]:
@@ -196,3 +177,6 @@ def _warnings(solution: Solution) -> list[str]:
         return []
     moving = f"{solution.last_step_m:.2f} m and {np.rad2deg(solution.last_step_rad):.2f} deg"
     return [f"filtered: after {solution.iterations} iterations still moving by {moving}; expected to settle"]
+
+
+METHOD: Final = Method(filtered_estimate, options=("positions",))

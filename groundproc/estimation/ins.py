@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.constants import NS_PER_MS, NS_PER_S
+from flightlog.constants import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
 from flightlog.errors import LogError
 from flightlog.mount import Mount
+from groundproc.estimation.alignment import align
 from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.trajectory import HOLD, Trajectory
@@ -35,6 +36,8 @@ SIGMA_TILT_RAD: Final = np.deg2rad(1.0)
 SIGMA_HEADING_RAD: Final = np.deg2rad(5.0)
 """What is assumed of an AHRS of the APM class with a compass; the autopilot states nothing (1 sigma)."""
 
+ALIGNMENT: Final = "alignment of IMU and positions"
+"""Where attitudes come from that nobody states."""
 HEIGHTS: Final = {
     "msl": "above mean sea level as the autopilot states it (the geoid of its GPS module, EGM 96 or coarser)",
     "ellipsoid": "above the WGS 84 ellipsoid",
@@ -123,7 +126,8 @@ def _known_positions(boot: Boot, name: str) -> npt.NDArray[np.bool_]:
 
 def attitude_source(boot: Boot) -> str | None:
     """The message that attitudes of a boot come from."""
-    return next((name for name in ("ATTITUDE", "ATTITUDE_QUATERNION", "AHRS2") if boot.has(name)), None)
+    named = next((name for name in ("ATTITUDE", "ATTITUDE_QUATERNION", "AHRS2") if boot.has(name)), None)
+    return named or (ALIGNMENT if boot.has("HIGHRES_IMU", 100) else None)
 
 
 def _global_positions(boot: Boot, height: str) -> PositionFixes:
@@ -223,10 +227,31 @@ def attitudes(boot: Boot) -> tuple[str, Times, Array, Array | None]:
             frames.mat_local_ins(*(table[f].astype(np.float64) for f in ("yaw", "pitch", "roll")))
         )
         return source, boot.stamps_ns[source], quat, None
+    elif boot.has("HIGHRES_IMU", 100) and boot.has("GPS_RAW_INT", 10):
+        return _aligned(boot)
     else:
         raise LogError("MAVLink: neither ATTITUDE nor ATTITUDE_QUATERNION nor AHRS2 in the log; an attitude is needed")
     frd = np.stack([table[f].astype(np.float64) for f in ("rollspeed", "pitchspeed", "yawspeed")], axis=1)
     return source, boot.stamps_ns[source], quat, frames.ins_from_frd(frd)
+
+
+def _aligned(boot: Boot) -> tuple[str, Times, Array, Array]:
+    """Attitudes of a kit that states none, from its IMU and its positions."""
+    table, stamp_ns = boot.tables["HIGHRES_IMU"], boot.stamps_ns["HIGHRES_IMU"]
+    rate, force = (
+        frames.ins_from_frd(np.stack([table[axis + kind].astype(np.float64) for axis in "xyz"], axis=1))
+        for kind in ("gyro", "acc")
+    )
+    fixes = _gps_positions(boot, "msl")
+    frame = LocalFrame(float(fixes.latitude_deg[0]), float(fixes.longitude_deg[0]), float(fixes.height_m[0]))
+    enu = frame.from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)
+    inside = (stamp_ns >= fixes.time_ns[0]) & (stamp_ns <= fixes.time_ns[-1])
+    start_ns = int(stamp_ns[inside][0])
+    imu_s: Array = np.asarray((stamp_ns[inside] - start_ns) * 1e-9, np.float64)
+    fix_s: Array = np.asarray((fixes.time_ns - start_ns) * 1e-9, np.float64)
+    sigma_m, gravity = float(np.median(fixes.sigma_m[:, 0])), STANDARD_GRAVITY_M_S2
+    quat = align(imu_s, rate[inside], force[inside], fix_s, np.asarray(enu, np.float64), sigma_m, gravity)
+    return ALIGNMENT, stamp_ns[inside], quat, rate[inside]
 
 
 def ins_trajectory(

@@ -1,9 +1,8 @@
-"""What every method of making a trajectory is given, and what it gives back."""
+"""What a method of making a trajectory is, and what it is given; it gives an Estimate back (`trajectory.estimate`)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
@@ -13,10 +12,11 @@ from groundproc.estimation.ins import PositionFixes
 from groundproc.flight.flight import Flight
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
-from groundproc.sensors.hdl32e import LaserTable
-from groundproc.sensors.lasers import ESTIMATE, read_lasers
+from groundproc.sensors.lasers import ESTIMATE, LaserCorrections, read_lasers
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import LaserTable
 from groundproc.survey import Survey
-from groundproc.trajectory.trajectory import Trajectory
+from groundproc.trajectory.estimate import Estimate
 
 Progress = Callable[[str, int], None]
 """Is told that so many more bytes of the logs are through a stage: "read", "adjust" or "place"."""
@@ -42,8 +42,10 @@ class Given:
     mount : Mount
         Nominal.
     survey : Survey
-    lasers : LaserTable
-        Of the survey's file; the manual's where it names none.
+    corrections : LaserCorrections
+        Of the lasers: of the survey's file; none where it names none.
+    mount_source : str
+        Where the mount comes from: "log", "survey" or a file.
     """
 
     readers: Sequence[LogReader]
@@ -54,47 +56,49 @@ class Given:
     frame: LocalFrame
     mount: Mount
     survey: Survey
-    lasers: LaserTable = field(default_factory=LaserTable.nominal)
+    corrections: LaserCorrections = field(default_factory=LaserCorrections)
+    mount_source: str = "as given"
+
+    @property
+    def lidar(self) -> Lidar:
+        """The lidar that was flown."""
+        return self.flight.lidar
+
+    @property
+    def lasers(self) -> LaserTable:
+        """The lasers to begin with: the manual's table with the corrections."""
+        return self.corrections.table(self.lidar.lasers)
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
-    """A trajectory, and all that was estimated with it.
+class Method:
+    """A way of making a trajectory; each stands in its own module, under the name METHOD.
 
     Attributes
     ----------
-    trajectory : Trajectory
-    mount : Mount
-        The one to place points with: the nominal one where the method estimates none.
-    sigma_source : str
-        What the trajectory's sigmas are, for the reader of quality.json.
-    lasers : LaserTable
-        Corrections of the single lasers; the manual's table where none are estimated.
-    report : dict
-        What else there is to say; stands in quality.json under the method's name.
-    warning : str
-        One sentence where the self-check found something wrong; empty where all is well.
-    products : tuple of callable
-        Each is called with the folder of the products and writes files of the method's own into it.
-    method : str
-        Name of the method that made it.
-    note : str
-        Why it is this method and not a better one; empty where it is the one that was asked for.
+    estimate : callable
+        Makes the estimate; LogError or CoverageError where the log does not hold what the method needs.
+    options : tuple of str
+        Options of the survey that not every method looks at, and this one does.
+    finds_lasers : bool
+        Whether it finds corrections of the single lasers where it is asked to.
+    uses_points : bool
+        Whether it looks at the lidar's returns, and so at which of them are kept.
     """
 
-    trajectory: Trajectory
-    mount: Mount
-    sigma_source: str
-    lasers: LaserTable = field(default_factory=LaserTable.nominal)
-    report: dict[str, Any] = field(default_factory=dict)
-    warning: str = ""
-    products: tuple[Callable[[Path], None], ...] = ()
-    method: str = ""
-    note: str = ""
+    estimate: Callable[[Given, Progress], Estimate]
+    options: tuple[str, ...] = ()
+    finds_lasers: bool = False
+    uses_points: bool = False
 
 
 def gather(
-    readers: Sequence[LogReader], flight: Flight, timeline: Sequence[Leg], mount: Mount, survey: Survey
+    readers: Sequence[LogReader],
+    flight: Flight,
+    timeline: Sequence[Leg],
+    mount: Mount,
+    survey: Survey,
+    mount_source: str = "as given",
 ) -> Given:
     """Positions of all legs in one local frame.
 
@@ -112,9 +116,10 @@ def gather(
     fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in placed]
     first = fixes[0]
     frame = LocalFrame(float(first.latitude_deg[0]), float(first.longitude_deg[0]), float(first.height_m[0]))
-    return Given(readers, flight, timeline, placed, fixes, frame, mount, survey, chosen_table(survey))
+    corrections = chosen_corrections(survey)
+    return Given(readers, flight, timeline, placed, fixes, frame, mount, survey, corrections, mount_source)
 
 
-def chosen_table(survey: Survey) -> LaserTable:
-    """The lasers as the survey has them: of its file, or the manual's, to begin with where they are to be estimated."""
-    return LaserTable.nominal() if survey.lasers in (None, ESTIMATE) else read_lasers(Path(survey.lasers)).table()
+def chosen_corrections(survey: Survey) -> LaserCorrections:
+    """Those of the lasers that the survey names; none to begin with where they are to be estimated."""
+    return LaserCorrections() if survey.lasers in (None, ESTIMATE) else read_lasers(Path(survey.lasers))

@@ -1,19 +1,26 @@
-"""The methods by their names on the command line."""
+"""The methods by their names: which are tried, what each looks at, and the estimate of the one that was chosen."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Final
-
-import numpy as np
+import importlib
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any, Final
 
 from flightlog.errors import CoverageError, LogError, UsageError
-from groundproc.estimation import filtered, ins
-from groundproc.estimation.adjustment import adjusted
-from groundproc.estimation.dynamic import dynamic
-from groundproc.estimation.method import Estimate, Given, Progress
+from groundproc.estimation.method import Given, Method, Progress
+from groundproc.flight.timeline import ties_of
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.survey import Survey
-from groundproc.trajectory.trajectory import Trajectory, joined
+from groundproc.survey.methods import METHODS
+from groundproc.trajectory.estimate import Estimate
+
+BEST: Final = ("adjusted", "filtered", "ins")
+"""What `best` tries, the best first; each needs less of the log than the one before."""
+
+
+def find(name: str) -> Method:
+    """The method of a name."""
+    found: Method = importlib.import_module(METHODS[name]).METHOD
+    return found
 
 
 def estimate(given: Given, progress: Progress) -> Estimate:
@@ -31,28 +38,33 @@ def estimate(given: Given, progress: Progress) -> Estimate:
     reasons: list[str] = []
     for name in names:
         try:
-            made = METHODS[name](given, progress)
+            made = find(name).estimate(given, progress)
         except (LogError, CoverageError) as error:
             if name == names[-1]:
                 raise
             reasons.append(f"not {name}, because {str(error).removeprefix(f'{name}: ')}")
             continue
-        lasers = made.lasers if given.survey.lasers == ESTIMATE else given.lasers
-        return replace(made, method=name, note="; ".join(reasons), lasers=lasers)
+        return replace(
+            made,
+            method=name,
+            note="; ".join(reasons),
+            corrections=made.corrections if given.survey.lasers == ESTIMATE else given.corrections,
+            ties=ties_of(given.timeline),
+            mount_source=made.mount_source or given.mount_source,
+        )
     raise AssertionError(f"no method for {given.survey.method}")
 
 
 def candidates(survey: Survey) -> tuple[str, ...]:
     """Methods to try, the best first.
 
-    `best` goes down only as far as the other options allow: only the adjustment is causal or takes control, only it and the filter take
-    positions.
+    `best` goes down only as far as the other options allow: a method that would not look at one of them is not tried.
     """
     if survey.method != "best":
         return (survey.method,)
-    if survey.causal or survey.control is not None:
-        return ("adjusted",)
-    return ("adjusted", "filtered") if survey.positions is not None else ("adjusted", "filtered", "ins")
+    asked = set(given_options(survey))
+    first, *others = BEST
+    return (first, *(name for name in others if asked <= set(find(name).options)))
 
 
 def check(survey: Survey) -> None:
@@ -63,72 +75,33 @@ def check(survey: Survey) -> None:
     UsageError
     """
     first = candidates(survey)[0]
-    for name, users in OPTIONS_OF.items():
-        value = getattr(survey, name)
-        if value in (None, False):
-            continue
-        if first not in users:
+    asked, known = given_options(survey), users()
+    for name, value in asked.items():
+        if first not in known[name]:
             raise UsageError(
-                f"{name}: {value} given, but only method {' or '.join(users)} uses it, not {survey.method}"
+                f"{name}: {value} given, but only method {' or '.join(known[name])} uses it, not {survey.method}"
             )
         if survey.causal and name != "causal":
             raise UsageError(
                 f"{name}: {value} given together with causal, which uses nothing that is known after the flight only"
             )
-    if survey.lasers == ESTIMATE and (survey.causal or candidates(survey)[0] != "adjusted"):
-        raise UsageError("lasers: estimate given, but only method adjusted finds them, and not with --causal")
+    if survey.lasers == ESTIMATE and (survey.causal or not find(first).finds_lasers):
+        finders = " or ".join(name for name in METHODS if find(name).finds_lasers)
+        raise UsageError(f"lasers: estimate given, but only method {finders} finds them, and not with --causal")
 
 
-def ins_estimate(given: Given, progress: Progress) -> Estimate:
-    """The autopilot's own solution, interpolated; a boot that never had a fix leaves a gap.
-
-    Raises
-    ------
-    LogError
-        No boot gives a trajectory.
-    """
-    del progress
-    placed, grid_ms = given.placed, given.survey.pose_grid_ms
-    grid_ns = None if grid_ms is None else round(grid_ms * 1e6)
-    parts: list[Trajectory] = []
-    reasons: list[LogError] = []
-    for number, (leg, fix) in enumerate(zip(placed, given.fixes, strict=True)):
-        try:
-            part = ins.ins_trajectory(leg.boot, fix, given.frame, leg.utc_from_boot, given.mount, grid_ns)
-        except LogError as error:
-            reasons.append(error)
-            continue
-        # a boot that went on over a jump of the lidar's clock belongs to both legs: each has its own side
-        if number and placed[number - 1].boot is leg.boot and parts:
-            part = part.after(int(parts[-1].time_ns[-1]))
-        if number + 1 < len(placed) and placed[number + 1].boot is leg.boot:
-            part = part.before(int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]))
-        if len(part) > 1:
-            parts.append(part)
-    if reasons and not parts:
-        raise reasons[0]
-    return Estimate(joined(parts), given.mount, ins.SIGMA_SOURCE)
+def users() -> Mapping[str, tuple[str, ...]]:
+    """Methods that look at an option, by the options that not all methods look at."""
+    options = {name: find(name).options for name in METHODS}
+    names = dict.fromkeys(option for each in options.values() for option in each)
+    return {name: tuple(method for method in METHODS if name in options[method]) for name in names}
 
 
-def adjusted_estimate(given: Given, progress: Progress) -> Estimate:
-    """Lidar, inertial sensors, GNSS and compass in one adjustment, begun from the autopilot's solution."""
-    return adjusted.estimate(given, progress, ins_estimate(given, progress).trajectory)
-
-
-def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
-    """The source's dynamic calibration of another method's trajectory."""
-    return dynamic.dynamic_estimate(given, progress, METHODS[given.survey.dynamic.start])
-
-
-OPTIONS_OF: Final = {
-    "positions": ("adjusted", "filtered"),
-    "control": ("adjusted",), "compass": ("dynamic",), "causal": ("adjusted",), "pose_grid_ms": ("ins",),
-}  # fmt: skip
-"""Options of the survey that some methods alone look at."""
-
-METHODS: Final[dict[str, Callable[[Given, Progress], Estimate]]] = {
-    "ins": ins_estimate,
-    "dynamic": dynamic_estimate,
-    "filtered": filtered.filtered_estimate,
-    "adjusted": adjusted_estimate,
-}
+def given_options(survey: Survey) -> dict[str, Any]:
+    """Options that not all methods look at and that are not at their defaults."""
+    plain, own = Survey(), users()
+    return {
+        field.name: getattr(survey, field.name)
+        for field in fields(survey)
+        if field.name in own and getattr(survey, field.name) != getattr(plain, field.name)
+    }

@@ -13,9 +13,11 @@ from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame, FrameParser
 from groundproc.flight import autopilot, load, timebase
 from groundproc.flight.autopilot import Boot
+from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import JUMP_NS, PositionSamples
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
+from groundproc.sensors.model import Lidar
 
 Progress = Callable[[int], None]
 
@@ -28,12 +30,15 @@ class Flight:
     ----------
     boots : list of Boot
     runs : list of LidarRun
+    lidar : Lidar
+        That it was recorded with.
     frames, bad_bytes, unknown : int
         MAVLink: frames read, bytes that belong to none, frames of messages outside the dialect.
     """
 
     boots: list[Boot]
     runs: list[LidarRun]
+    lidar: Lidar
     frames: int = 0
     bad_bytes: int = 0
     unknown: int = 0
@@ -48,7 +53,8 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     LogError
         No lidar packets, or no autopilot, in the logs.
     """
-    parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers))
+    lidar = lidar_of(readers)
+    parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers, lidar))
     count, kept = 0, []
     for frame in _frames(readers, link, parser, samples, progress):
         count += 1
@@ -59,10 +65,10 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
             f"{readers[0].path}: no MAVLink of the link {link!r} in the log; a trajectory needs an autopilot"
         )
     boots = autopilot.boots(kept)
-    runs = _runs(readers, samples.samples())
+    runs = _runs(readers, samples.samples(), lidar)
     if not runs:
         raise LogError(f"{readers[0].path}: no lidar packets in the log")
-    return Flight(boots, runs, count, parser.bad_bytes, parser.unknown)
+    return Flight(boots, runs, lidar, count, parser.bad_bytes, parser.unknown)
 
 
 def _frames(
@@ -83,12 +89,12 @@ def _frames(
     yield from parser.finish()
 
 
-def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarRun]:
+def _runs(readers: Sequence[LogReader], samples: PositionSamples, lidar: Lidar) -> list[LidarRun]:
     """Cut at the jumps of the lidar's clock against receive times."""
     device, receive = samples.device_time_ns, samples.receive_time_ns
     has_positions = len(device) >= 2
     if not has_positions:
-        device, receive = _batch_times(readers)
+        device, receive = _batch_times(readers, lidar)
     if len(device) < 2:
         return []
     cuts = np.flatnonzero(np.abs(np.diff(device - receive)) > JUMP_NS) + 1
@@ -104,10 +110,12 @@ def _runs(readers: Sequence[LogReader], samples: PositionSamples) -> list[LidarR
     return runs
 
 
-def _batch_times(readers: Sequence[LogReader]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _batch_times(readers: Sequence[LogReader], lidar: Lidar) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Lidar and receive time of the first packet of every batch: for logs without position packets."""
     pairs = [
-        (int(b.device_time_ns[0]), int(b.receive_time_ns[0])) for b in load.lidar_batches(readers) if len(b.packets)
+        (int(b.device_time_ns[0]), int(b.receive_time_ns[0]))
+        for b in load.lidar_batches(readers, None, lidar)
+        if len(b.packets)
     ]
     table = np.array(pairs, np.int64).reshape(-1, 2)
     return table[:, 0], table[:, 1]

@@ -11,11 +11,14 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flightlog import clock, hdl32e, records
-from flightlog.constants import NS_PER_S, NS_PER_US, STANDARD_GRAVITY_M_S2
+from flightlog import clock, records
+from flightlog.constants import HOUR_NS, NS_PER_S, NS_PER_US
 from flightlog.logfile import LogReader, Message
 from flightlog.mavlink import Frame, FrameParser
 from flightlog.records import LidarAccount
+from groundproc.flight.lidar import lidar_of
+from groundproc.sensors import velodyne
+from groundproc.sensors.model import Lidar, Readings
 
 Progress = Callable[[int], None]
 
@@ -25,14 +28,14 @@ JUMP_NS: Final = NS_PER_S // 2
 
 @dataclass(frozen=True, slots=True)
 class LidarBatch:
-    """The packets of one message, about 0.1 s.
+    """The packets of one message: about 0.1 s, or a line of a line scanner.
 
     Attributes
     ----------
     log_time_ns : int
         Log time of the message [ns].
-    packets : ndarray of records.SCAN_PACKET_DTYPE, shape (n,)
-        May be empty: everything was masked.
+    packets : structured ndarray, shape (n,)
+        Records as the lidar's model has them; may be empty: everything was masked.
     receive_time_ns : ndarray of int64, shape (n,)
         Receive times [ns of log time].
     device_time_ns : ndarray of int64, shape (n,)
@@ -79,7 +82,7 @@ class PositionSamples:
     has_imu : ndarray of bool, shape (n,)
         Whether the packet carries readings of the gyros at all.
     pps : ndarray of uint8, shape (n,)
-        hdl32e.PpsState.
+        flightlog.hdl32e.PpsState.
     sentences : list of Sentence
         Each when it first appeared.
     clock_jumps : int
@@ -133,18 +136,18 @@ def in_order(readers: Sequence[LogReader]) -> list[LogReader]:
     return sorted(readers, key=lambda reader: reader.start_ns)
 
 
-def first_stamp(readers: Sequence[LogReader]) -> DeviceClock:
+def first_stamp(readers: Sequence[LogReader], lidar: Lidar | None = None) -> DeviceClock:
     """A clock that stands at the first lidar packet, or at the first position packet where there is none.
 
     Every stream of the lidar starts from it, so that all of them agree about the hour.
     """
-    topics = (records.LIDAR.topic, records.POSITION.topic)
-    for topic in topics:
+    lidar = lidar or lidar_of(readers)
+    for topic in (lidar.topic, records.POSITION.topic):
         for reader in in_order(readers):
             for message in reader.messages((topic,)):
-                if topic == records.LIDAR.topic:
-                    packets = records.decode_scan(message.data)
-                    stamps_us, receive_ns = packets["data"]["stamp_us"], records.receive_time_ns(packets)
+                if topic == lidar.topic:
+                    packets = lidar.unpack(message.data)
+                    stamps_us, receive_ns = stamps_of(lidar, packets), lidar.receive_time_ns(packets)
                 else:
                     receive_ns, position = records.decode_position(message.data)
                     stamps_us = position["stamp_us"]
@@ -155,11 +158,19 @@ def first_stamp(readers: Sequence[LogReader]) -> DeviceClock:
     return DeviceClock()
 
 
-def lidar_batches(readers: Sequence[LogReader], progress: Progress | None = None) -> Iterator[LidarBatch]:
+def stamps_of(lidar: Lidar, packets: npt.NDArray[np.void]) -> npt.NDArray[np.uint32]:
+    """Stamps past the hour [us], shape (n,)."""
+    return np.asarray(lidar.stamp_ns(packets) % HOUR_NS // NS_PER_US, np.uint32)
+
+
+def lidar_batches(
+    readers: Sequence[LogReader], progress: Progress | None = None, lidar: Lidar | None = None
+) -> Iterator[LidarBatch]:
     """Stream the lidar packets of one or several logs, each message with its account."""
-    joiner = BatchJoiner(first_stamp(readers))
+    lidar = lidar or lidar_of(readers)
+    joiner = BatchJoiner(lidar, first_stamp(readers, lidar))
     for reader in in_order(readers):
-        for message in reader.messages(BatchJoiner.TOPICS, progress):
+        for message in reader.messages(joiner.topics, progress):
             yield from joiner.feed(message)
         yield from joiner.finish()
 
@@ -167,20 +178,20 @@ def lidar_batches(readers: Sequence[LogReader], progress: Progress | None = None
 class BatchJoiner:
     """Joins packets and account, two messages of one log time that may come in either order."""
 
-    TOPICS: Final = (records.LIDAR.topic, records.LIDAR_ACCOUNT.topic)
-
-    def __init__(self, device: DeviceClock) -> None:
+    def __init__(self, lidar: Lidar, device: DeviceClock) -> None:
+        self.topics = (lidar.topic, records.LIDAR_ACCOUNT.topic)
         self.device = device
+        self._lidar = lidar
         self._log_time_ns = -1
         self._packets: list[npt.NDArray[np.void]] = []
         self._account: LidarAccount | None = None
 
     def feed(self, message: Message) -> list[LidarBatch]:
-        """Take a message of TOPICS; give the batch before it, when it is complete."""
+        """Take a message of `topics`; give the batch before it, when it is complete."""
         done = self.finish() if message.log_time_ns != self._log_time_ns else []
         self._log_time_ns = message.log_time_ns
-        if message.topic == records.LIDAR.topic:
-            self._packets.append(records.decode_scan(message.data))
+        if message.topic == self._lidar.topic:
+            self._packets.append(self._lidar.unpack(message.data))
         else:
             self._account = records.decode_account(message.data)
         return done
@@ -189,22 +200,26 @@ class BatchJoiner:
         """Give the last batch."""
         if not self._packets and self._account is None:
             return []
+        if not self._packets:
+            self._packets = [np.empty(0, records.SCAN_PACKET_DTYPE)]
         packets = joined(self._packets)
         account, self._packets, self._account = self._account, [], None
-        receive_ns = records.receive_time_ns(packets)
         if not len(packets):
-            return [LidarBatch(self._log_time_ns, packets, receive_ns, receive_ns, account)]
-        device_ns, jumped = self.device.extend(packets["data"]["stamp_us"], receive_ns)
+            nothing = np.empty(0, np.int64)
+            return [LidarBatch(self._log_time_ns, packets, nothing, nothing, account)]
+        receive_ns = self._lidar.receive_time_ns(packets)
+        if not self._lidar.stamp_wraps:
+            return [LidarBatch(self._log_time_ns, packets, receive_ns, self._lidar.stamp_ns(packets), account)]
+        device_ns, jumped = self.device.extend(stamps_of(self._lidar, packets), receive_ns)
         return [LidarBatch(self._log_time_ns, packets, receive_ns, device_ns, account, jumped)]
 
 
 def joined(parts: Sequence[npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
-    """Packets of SCAN_PACKET_DTYPE in one array, shape (n,); a single part as it is."""
+    """Packets of one dtype in one array, shape (n,); a single part as it is."""
     if len(parts) == 1:
         return parts[0]
     # as bytes: numpy copies records field by field
-    raw = [part.view(np.uint8) for part in parts]
-    return np.concatenate([np.empty(0, np.uint8), *raw]).view(records.SCAN_PACKET_DTYPE)
+    return np.concatenate([part.view(np.uint8) for part in parts]).view(parts[0].dtype)
 
 
 def position_samples(readers: Sequence[LogReader], progress: Progress | None = None) -> PositionSamples:
@@ -233,12 +248,12 @@ class PositionCollector:
     def feed(self, message: Message) -> None:
         """Take the next message of the position topic."""
         receive_ns, packets = records.decode_position(message.data)
-        good = hdl32e.is_position(packets)
+        good = velodyne.is_position(packets)
         receive_ns, packets = receive_ns[good], packets[good]
         if not len(packets):
             return
         device_ns, _ = self._device.extend(packets["stamp_us"], receive_ns)
-        batch = PositionBatch(packets, receive_ns, device_ns)
+        batch = PositionBatch(velodyne.readings(packets), receive_ns, device_ns)
         self._parts.append(_samples(batch))
         self._sentences += new_sentences(batch, self._sentences[-1].text if self._sentences else "")
 
@@ -252,37 +267,40 @@ class PositionCollector:
         )
 
 
-def _samples(batch: "PositionBatch") -> tuple[npt.NDArray[Any], ...]:
-    """The columns of PositionSamples, in its order."""
-    packets = batch.packets
-    return (
-        batch.device_time_ns,
-        batch.receive_time_ns,
-        np.deg2rad(hdl32e.gyro_deg_s(packets)),
-        hdl32e.accel_g(packets) * STANDARD_GRAVITY_M_S2,
-        hdl32e.temperature_c(packets),
-        hdl32e.has_imu(packets),
-        packets["pps"].copy(),
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class PositionBatch:
-    """The position packets of one message; fields as in LidarBatch, packets of hdl32e.POSITION_DTYPE."""
+    """The position packets of one message, read; times as in LidarBatch."""
 
-    packets: npt.NDArray[np.void]
+    readings: Readings
     receive_time_ns: npt.NDArray[np.int64]
     device_time_ns: npt.NDArray[np.int64]
 
+    def __len__(self) -> int:
+        return len(self.device_time_ns)
+
+
+def _samples(batch: PositionBatch) -> tuple[npt.NDArray[Any], ...]:
+    """The columns of PositionSamples, in its order."""
+    read = batch.readings
+    return (
+        batch.device_time_ns,
+        batch.receive_time_ns,
+        read.gyro_rad_s,
+        read.accel_m_s2,
+        read.temperature_c,
+        read.has_imu,
+        read.pps,
+    )
+
 
 _NO_SAMPLES: Final = _samples(
-    PositionBatch(np.empty(0, hdl32e.POSITION_DTYPE), np.empty(0, np.int64), np.empty(0, np.int64))
+    PositionBatch(velodyne.readings(velodyne.position_packets(b"")), np.empty(0, np.int64), np.empty(0, np.int64))
 )
 
 
 def new_sentences(batch: PositionBatch, last: str) -> list[Sentence]:
     """The sentences of a batch that differ from the one before, the first from `last`."""
-    texts = batch.packets["nmea"]
+    texts = batch.readings.sentences
     changed = np.ones(len(texts), np.bool_)
     changed[1:] = texts[1:] != texts[:-1]
     found: list[Sentence] = []

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flightlog.clock import utc_text
 from flightlog.constants import NS_PER_S
 from flightlog.errors import ClockError, SyncError
 from flightlog.nmea import Rmc
@@ -76,6 +77,30 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockTie:
+    """How the time of one run of the lidar's clock becomes UTC; with it a later run of the program places points at the same instants.
+
+    Attributes
+    ----------
+    first_receive_ns, last_receive_ns : int
+        Receive times of the run [log], by which it is known again.
+    lines : tuple of Line
+        One after the other: from lidar time to UTC.
+    source : str
+        What says which UTC it is: "gprmc", "system_time" or "host".
+    """
+
+    first_receive_ns: int
+    last_receive_ns: int
+    lines: tuple[Line, ...]
+    source: str
+
+    def overlap_ns(self, first_receive_ns: int, last_receive_ns: int) -> int:
+        """How long this run and a stretch of receive time have in common; negative where they are apart."""
+        return min(self.last_receive_ns, last_receive_ns) - max(self.first_receive_ns, first_receive_ns)
+
+
+@dataclass(frozen=True, slots=True)
 class Leg:
     """One boot with one run of the lidar's clock.
 
@@ -113,6 +138,39 @@ class Leg:
     def utc_from_boot(self, time_ns: Times) -> Times:
         """UTC [ns] of boot times, shape (n,)."""
         return self.utc_from_lidar(_line(self.sync).inverse()(time_ns))
+
+
+def ties_of(timeline: Sequence[Leg]) -> tuple[ClockTie, ...]:
+    """The lidar's clock of each run in a timeline; legs of one run share it."""
+    runs = {leg.run: leg for leg in reversed(timeline)}
+    return tuple(
+        ClockTie(leg.first_receive_ns, leg.last_receive_ns, leg.lidar_line, leg.utc.source)
+        for _, leg in sorted(runs.items())
+    )
+
+
+def tied(timeline: Sequence[Leg], ties: Sequence[ClockTie]) -> list[Leg]:
+    """The legs with the lidar's clock as ties of an earlier run of the program have it.
+
+    Raises
+    ------
+    ClockError
+        No leg was recorded when any of the ties holds.
+    """
+    made, met = [], False
+    for leg in timeline:
+        receive_ns = leg.first_receive_ns, leg.last_receive_ns
+        best = max(ties, key=lambda tie: tie.overlap_ns(*receive_ns), default=None)
+        if best is not None and best.overlap_ns(*receive_ns) > 0:
+            leg, met = replace(leg, lidar_line=best.lines), True
+        made.append(leg)
+    if not met:
+        known = " and ".join(f"{utc_text(t.first_receive_ns)} to {utc_text(t.last_receive_ns)}" for t in ties)
+        raise ClockError(
+            f"clock ties: they hold from {known or 'never'}, and the log was recorded from {utc_text(timeline[0].first_receive_ns)}; is it "
+            "of the same flight?"
+        )
+    return made
 
 
 def _line(found: Sync) -> Line:

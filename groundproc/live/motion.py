@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import CUBIC_BELOW_HZ, ImuTrack, on_grid
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -79,12 +80,11 @@ class Samples:
 
 def white_noise(samples: Array) -> float:
     """White noise of a sample, from second differences: robust, all axes together; shape (n, 3)."""
-    second = samples[2:] - 2.0 * samples[1:-1] + samples[:-2]
-    return float(1.4826 * np.median(np.abs(second - np.median(second, axis=0))) / np.sqrt(6.0))
+    return robust.white_noise(samples)
 
 
 class GrowingMotion:
-    """What `groundproc.estimation.adjustment.motion.Motion` is, for a flight that goes on.
+    """A `MotionGrid` that grows: the motion of a flight that goes on.
 
     Parameters
     ----------

@@ -9,11 +9,12 @@ import numpy as np
 from flightlog import frames
 from flightlog.errors import SourceError
 from groundproc import geodesy
-from groundproc.cloud import las
+from groundproc.cloud.points import Points
+from groundproc.cloud.writer import CloudWriter, round_origin_m
 from groundproc.files import written_aside
 from groundproc.flight.positions.posetable import COLUMNS
 from groundproc.geodesy import LocalFrame
-from groundproc.live.estimator import Place
+from groundproc.live.place import Place
 from groundproc.live.voxelcloud import VoxelCloud
 
 MORE_COLUMNS: Final = ("lidar_ns", "matched", "seen", "residual_m", "lag_s")
@@ -87,12 +88,10 @@ def write_cloud(path: Path, cloud: VoxelCloud, frame: LocalFrame, utc_offset_ns:
     crs = geodesy.projected_crs(geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg))
     projection = geodesy.Projection(frame, crs)
     stated = geodesy.with_sea_level(crs) if height == "msl" else crs
-    start = projection.exact(np.zeros((1, 3)))[0]
-    offset_m = [float(np.floor(start[0] / 100) * 100), float(np.floor(start[1] / 100) * 100), 0.0]
-    with written_aside(path) as aside, las.CloudWriter(aside, [], crs=stated, offset_m=offset_m) as writer:
+    origin_m = round_origin_m(projection.exact(np.zeros((1, 3)))[0])
+    with written_aside(path) as aside, CloudWriter(aside, ["intensity"], crs=stated, offset_m=origin_m) as writer:
         for first in range(0, len(xyz), _PART):
             part = slice(first, first + _PART)
             world = projection.exact(xyz[part].astype(np.float64))
-            times = las.gps_time_s(time_ns[part] + utc_offset_ns)
-            writer.write(world, times, intensity[part], np.full(len(world), 0x11, np.uint8), {})
+            writer.write(Points(time_ns[part] + utc_offset_ns, world, {"intensity": intensity[part]}))
     return len(xyz)

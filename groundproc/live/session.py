@@ -11,18 +11,21 @@ from typing import Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from flightlog import hdl32e, records
-from flightlog.constants import NS_PER_S, STANDARD_GRAVITY_M_S2
+from flightlog import records
+from flightlog.constants import NS_PER_S
 from flightlog.hdl32e import POSITION_BYTES
+from groundproc import sensors
 from groundproc.flight import load
 from groundproc.flight.load import DeviceClock, PositionBatch
 from groundproc.geodesy import LocalFrame
-from groundproc.live.estimator import Estimator, Figures, Options, Place
+from groundproc.live.estimator import Estimator, Options
 from groundproc.live.inbox import Inbox, Received
+from groundproc.live.place import Figures, Place
 from groundproc.live.products import LiveTrajectory, write_cloud
 from groundproc.live.receivers import Counts
 from groundproc.live.telemetry import Telemetry
 from groundproc.live.voxelcloud import VoxelCloud
+from groundproc.sensors import velodyne
 
 SILENT_S: Final = 2.0
 """Without a packet for so long the lidar is said to be silent."""
@@ -127,6 +130,7 @@ class Session:
         self._options, self._inbox, self._source, self._trajectory = options, inbox, source, trajectory
         self._telemetry, self._figures = Telemetry(), Figures()
         self._lag = Lag()
+        self._lidar = sensors.lidar(sensors.FLOWN)
         self._estimator = Estimator(options, self._telemetry, self._figures, None)
         self._data_clock = self._position_clock = DeviceClock()
         self._anchored = False
@@ -207,10 +211,10 @@ class Session:
             self._take_positions(item)
 
     def _take_packets(self, item: Received) -> None:
-        packets = item.packets[hdl32e.is_data(item.packets["data"])]
+        packets = item.packets[self._lidar.valid(item.packets)]
         if not len(packets):
             return
-        receive_ns, stamps = records.receive_time_ns(packets), packets["data"]["stamp_us"]
+        receive_ns, stamps = self._lidar.receive_time_ns(packets), load.stamps_of(self._lidar, packets)
         self._anchor(stamps, receive_ns)
         device_ns, jumped = self._data_clock.extend(stamps, receive_ns)
         if jumped:
@@ -226,9 +230,9 @@ class Session:
 
     def _take_positions(self, item: Received) -> None:
         chunks = [chunk for chunk in item.chunks if len(chunk[1]) == POSITION_BYTES]
-        packets = np.frombuffer(b"".join(data for _, data in chunks), hdl32e.POSITION_DTYPE)
+        packets = velodyne.position_packets(b"".join(data for _, data in chunks))
         receive_ns = np.array([time_ns for time_ns, _ in chunks], np.int64)
-        good = hdl32e.is_position(packets) if len(packets) else np.zeros(0, np.bool_)
+        good = velodyne.is_position(packets) if len(packets) else np.zeros(0, np.bool_)
         packets, receive_ns = packets[good], receive_ns[good]
         if not len(packets):
             return
@@ -238,14 +242,14 @@ class Session:
             self._begin_anew()
             return
         self._positions += len(packets)
-        sentences = load.new_sentences(PositionBatch(packets, receive_ns, device_ns), self._text)
+        readings = velodyne.readings(packets)
+        sentences = load.new_sentences(PositionBatch(readings, receive_ns, device_ns), self._text)
         if sentences:
             self._text = sentences[-1].text
             self._estimator.times.hear(sentences)
-        has = hdl32e.has_imu(packets)
+        has = readings.has_imu
         if has.any():
-            rate = np.deg2rad(hdl32e.gyro_deg_s(packets[has]))
-            self._estimator.inertial(device_ns[has], rate, hdl32e.accel_g(packets[has]) * STANDARD_GRAVITY_M_S2)
+            self._estimator.inertial(device_ns[has], readings.gyro_rad_s[has], readings.accel_m_s2[has])
 
     def _anchor(self, stamps: npt.NDArray[np.uint32], receive_ns: npt.NDArray[np.int64]) -> None:
         """Both streams of the lidar count from the same hour."""

@@ -7,9 +7,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from groundproc import sensors
 from groundproc.estimation.odometry.grid import SLICE_NS
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors import shots as seen
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import Gate
 
 _MOST_AHEAD: Final = 40
 """Slices that may wait for the motion; what comes farther ahead is dropped."""
@@ -46,6 +48,8 @@ class Slicer:
     Parameters
     ----------
     gate : Gate
+    lidar : Lidar, optional
+        Default: the model that is flown.
 
     Attributes
     ----------
@@ -55,21 +59,20 @@ class Slicer:
         Returns whose slice had gone.
     """
 
-    def __init__(self, gate: Gate) -> None:
-        self._gate = gate
+    def __init__(self, gate: Gate, lidar: Lidar | None = None) -> None:
+        self._lidar, self._gate = lidar or sensors.lidar(sensors.FLOWN), gate
         self._parts: dict[int, list[Shots]] = {}
         self._next: int | None = None
         self.last_ns: int | None = None
         self.late = 0
 
     def feed(self, packets: npt.NDArray[np.void], device_ns: npt.NDArray[np.int64]) -> None:
-        """Take packets of SCAN_PACKET_DTYPE with their lidar times [ns], shape (n,)."""
-        for part, times in decode.by_mode(packets, device_ns):
-            if len(part):
-                self._sort(decode.decode(part, times, self._gate))
+        """Take packets with their lidar times [ns], shape (n,)."""
+        for shots in self._lidar.decode(packets, device_ns, self._gate):
+            self._sort(shots)
         self.last_ns = max(int(device_ns.max()), self.last_ns or 0)
 
-    def _sort(self, shots: decode.Shots) -> None:
+    def _sort(self, shots: seen.Shots) -> None:
         slot = shots.time_ns // SLICE_NS
         edges = [0, *(np.flatnonzero(np.diff(slot)) + 1).tolist(), len(slot)]
         for first, last in itertools.pairwise(edges):

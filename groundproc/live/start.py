@@ -1,43 +1,52 @@
-"""Rough poses to begin from, at the lidar's own time: the autopilot's, carried on over the delay of its link by the gyros."""
+"""Where the odometry begins in flight: the autopilot's poses carried on over the delay of its link, and the offset of the lidar's gyros."""
+
+from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from flightlog.errors import LogError
-from flightlog.mount import Mount
-from groundproc.estimation import ins
 from groundproc.estimation.odometry.grid import STEP_NS
+from groundproc.estimation.odometry.motion import MotionGrid
 from groundproc.estimation.odometry.spline import integrated
 from groundproc.flight.autopilot import Boot
-from groundproc.geodesy import LocalFrame
 from groundproc.live.clocks import Tie
-from groundproc.live.motion import GrowingMotion, Samples
+from groundproc.live.motion import Samples
 from groundproc.trajectory.trajectory import Poses, Trajectory
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
-LONGEST_LINK_DELAY_NS: int = 3_000_000_000
-_LARGEST_GAP_S = 0.5
+LONGEST_LINK_DELAY_NS: Final = 3_000_000_000
+_LARGEST_GAP_S: Final = 0.5
 
 
-class RoughPoses:
-    """Stands in for a trajectory where the odometry begins.
+class CarriedPoses:
+    """The autopilot's poses up to what has been heard, and beyond that carried on by the gyros and the last velocity.
 
     Parameters
     ----------
     known : Trajectory
-        The autopilot's, on lidar time, up to what has been heard.
-    motion : GrowingMotion
-    gyro_bias : ndarray, shape (3,)
+        On lidar time.
+    newest : callable
+        Gives what is known by now, or None; it is asked whenever poses are.
+    motion : MotionGrid
+    gyro_bias : callable
+        Gives the bias as known by now [rad/s], shape (3,).
     mat_ins_lidar : ndarray, shape (3, 3)
     """
 
-    def __init__(self, known: Trajectory, motion: GrowingMotion, gyro_bias: Array, mat_ins_lidar: Array) -> None:
-        self._known, self._motion, self._bias, self._mat = known, motion, gyro_bias, mat_ins_lidar
+    def __init__(
+        self, known: Trajectory, newest: Callable[[], Trajectory | None], motion: MotionGrid,
+        gyro_bias: Callable[[], Array], mat_ins_lidar: Array,
+    ) -> None:  # fmt: skip
+        self._known, self._newest, self._motion = known, newest, motion
+        self._bias, self._mat = gyro_bias, mat_ins_lidar
 
     def where_covered(self, time_ns: Times) -> tuple[Poses, npt.NDArray[np.bool_]]:
         """Poses at times, shape (n,), and which of them are covered."""
+        newest = self._newest()
+        self._known = self._known if newest is None else newest
         poses, covered = self._known.where_covered(time_ns)
         for i in np.flatnonzero(~covered & (time_ns >= self._known.time_ns[-1])).tolist():
             covered[i] = self._carry_on(int(time_ns[i]), poses, i)
@@ -49,20 +58,11 @@ class RoughPoses:
         first, last = (last_ns - motion.start_ns) // STEP_NS, (time_ns - motion.start_ns) // STEP_NS
         if since_ns > LONGEST_LINK_DELAY_NS or first < 0 or last > len(motion):
             return False
-        rate = (motion.rate_rad_s[first:last] - self._bias) @ self._mat.T
+        rate = (motion.rate_rad_s[first:last] - self._bias()) @ self._mat.T
         quat = integrated(np.ascontiguousarray(rate), self._known.quat_local_ins_wxyz[-1])
         poses.quat_local_ins_wxyz[row] = quat[-1]
         poses.position_m[row] = self._known.position_m[-1] + since_ns * 1e-9 * self._known.velocity_m_s[-1]
         return True
-
-
-def autopilot_poses(boot: Boot, height: str, frame: LocalFrame, tie: Tie, mount: Mount) -> Trajectory | None:
-    """The autopilot's own trajectory on lidar time; None where it cannot be made yet."""
-    try:
-        fixes = ins.position_fixes(boot, height)
-        return ins.ins_trajectory(boot, fixes, frame, tie.lidar_ns, mount)
-    except LogError:
-        return None
 
 
 def gyro_offset(own: Samples, boot: Boot, tie: Tie, mat_ins_lidar: Array) -> Array | None:

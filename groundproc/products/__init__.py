@@ -1,1 +1,126 @@
-"""What people take home: clouds (las), pictures."""
+"""What is made of a flight: one file here for each product, and one line in `REGISTRY`.
+
+A product that sees the points is a class with `begin(context)`, `add(points)` and `finish()`; one that is made of what a finished flight
+left behind is a function of `Context`. One with options of its own has a frozen dataclass `Options` beside it, which the class or the
+function is given. Modules are imported when a product is chosen, so that the command line stays fast.
+"""
+
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from flightlog import config
+from flightlog.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Where a product is written, and what it is.
+
+    Attributes
+    ----------
+    module, attribute : str
+        Of its class or function.
+    about : str
+        A few words for people.
+    by_default : bool
+        Made where the survey chooses none.
+    """
+
+    module: str
+    attribute: str
+    about: str
+    by_default: bool = True
+
+
+REGISTRY: Final[dict[str, Entry]] = {
+    "cloud.laz": Entry("groundproc.products.cloud_laz", "CloudLaz", "all points, LAS 1.4 compressed"),
+    "pictures": Entry(
+        "groundproc.products.pictures", "Pictures", "cloud_height.png, cloud_intensity.png: from above and from the south"
+    ),
+    "adjustment.png": Entry(
+        "groundproc.products.adjustment_plot", "draw", "method adjusted: what it left over, and how well it knows what it estimated"
+    ),
+    "lasers.png": Entry("groundproc.products.laser_plot", "draw", "lasers: estimate: corrections of the single lasers"),
+    "trims.csv": Entry("groundproc.products.trim_table", "write", "method dynamic: the trims of each revolution"),
+    "trims.png": Entry("groundproc.products.trim_plot", "draw", "method dynamic: the trims over time"),
+}  # fmt: skip
+"""All products by name, in the order in which they are made."""
+ALWAYS: Final = ("trajectory.csv", "quality.json")
+"""What the steps leave whatever is chosen; a survey may name them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A product that is to be made.
+
+    Attributes
+    ----------
+    name : str
+    maker : type or callable
+        A class of points, or a function of a finished flight.
+    options : tuple
+        Its `Options` where it has some; else empty.
+    """
+
+    name: str
+    maker: Any
+    options: tuple[Any, ...]
+
+    @property
+    def takes_points(self) -> bool:
+        """Whether it is made while points are placed."""
+        return isinstance(self.maker, type)
+
+
+def chosen(wanted: Sequence[Any] | None) -> list[Chosen]:
+    """The products of a survey, in the order of the registry.
+
+    Parameters
+    ----------
+    wanted : sequence of str or mapping, optional
+        Names; or one name with its options, `{"dsm.tif": {"cell_m": 0.5}}`. Default: all that are made by default.
+
+    Raises
+    ------
+    ConfigError
+        A name or an option that there is not, or a product named twice.
+    """
+    if wanted is None:
+        wanted = [name for name, entry in REGISTRY.items() if entry.by_default]
+    options: dict[str, Any] = {}
+    for item in wanted:
+        if item in ALWAYS:
+            continue
+        name, given = _read(item)
+        if name in options:
+            raise ConfigError(f"products: {name!r} stands there twice, expected once")
+        options[name] = given
+    return [_loaded(name, options[name]) for name in REGISTRY if name in options]
+
+
+def plain(products: Iterable[Chosen]) -> dict[str, Any]:
+    """Chosen products and their options as plain values by name: what decides whether they are to be made again."""
+    return {each.name: [config.to_mapping(options) for options in each.options] for each in products}
+
+
+def _read(item: Any) -> tuple[str, Any]:
+    """Name and options of one item of the survey's list."""
+    if isinstance(item, Mapping) and len(item) == 1:
+        ((item, given),) = item.items()
+    else:
+        given = {}
+    if not isinstance(item, str) or item not in REGISTRY:
+        raise ConfigError(f"products: {item!r} found, expected some of {', '.join((*REGISTRY, *ALWAYS))}")
+    return item, given
+
+
+def _loaded(name: str, given: Any) -> Chosen:
+    entry = REGISTRY[name]
+    module = importlib.import_module(entry.module)
+    own = getattr(module, "Options", None)
+    if own is None and given:
+        raise ConfigError(f"products: {name}: {given!r} found, but it has no options")
+    options = () if own is None else (config.from_mapping(given, own, f"products: {name}"),)
+    return Chosen(name, getattr(module, entry.attribute), options)

@@ -1,7 +1,7 @@
 """adjustment.png: what the adjustment left over, over time, and how well it knows what it estimated."""
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
@@ -11,15 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter
 from matplotlib.transforms import Bbox
 
-from flightlog import frames
-from groundproc.estimation.adjustment.adjusted import CausalRun, Run, attitude_track, position_track
-from groundproc.estimation.method import Given
-from groundproc.estimation.odometry.grid import STEP_NS, STEPS
-from groundproc.estimation.odometry.spline import Path as SensorPath
-from groundproc.estimation.odometry.stated import Attitudes, Positions
-from groundproc.estimation.odometry.track import boundaries_ns
-from groundproc.files import written_aside
-from groundproc.trajectory.trajectory import Trajectory
+from groundproc.products.product import Context
 
 Array = npt.NDArray[np.float64]
 
@@ -41,11 +33,10 @@ DOT: Final[dict[str, Any]] = {"marker": ".", "linestyle": "", "markersize": 3}
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """What the picture shows of one run.
+    """What the picture shows of one run: the estimate's figures by their names, less "adjustment.".
 
     Attributes
     ----------
-    title : str
     slice_s : ndarray, shape (n,)
         End of each slice of a tenth of a second, from the run's first.
     matched, seen : ndarray, shape (n,)
@@ -61,13 +52,16 @@ class Sheet:
         Stated positions less the path.
     heading_rad, heading_off_rad : ndarray, shape (j,)
         Stated headings less those of the path.
-    curve_rad : ndarray, shape (5,) or None
-        The compass curve as estimated.
-    estimated : dict
-        As in quality.json.
+    curve_rad : ndarray, shape (5,)
+        The compass curve as estimated; empty where there is none.
+    windows, restarts, is_worse : ndarray, shape ()
+        How many windows there were (0: causal), how often the odometry began anew, whether the trajectory is what it began from.
+    round_name, round_value : ndarray, shape (r,)
+        Chi-square and residuals in sigma of the last round.
+    estimated_name, estimated_value, estimated_sigma, estimated_prior_sigma, estimated_held : ndarray, shape (p,)
+        A row for each number that was estimated, in units of quality.json.
     """
 
-    title: str
     slice_s: Array
     matched: Array
     seen: Array
@@ -82,111 +76,57 @@ class Sheet:
     position_sigma_m: Array
     heading_rad: Array
     heading_off_rad: Array
-    curve_rad: Array | None
-    estimated: dict[str, Any]
+    curve_rad: Array
+    windows: npt.NDArray[Any]
+    restarts: npt.NDArray[Any]
+    is_worse: npt.NDArray[Any]
+    round_name: npt.NDArray[np.str_]
+    round_value: Array
+    estimated_name: npt.NDArray[np.str_]
+    estimated_value: Array
+    estimated_sigma: Array
+    estimated_prior_sigma: Array
+    estimated_held: npt.NDArray[np.bool_]
 
 
-def sheet_of(run: Run | CausalRun, given: Given, trajectory: Trajectory) -> Sheet:
-    """Gather the picture's numbers.
+def draw(context: Context) -> None:
+    """Draw the estimate's figures; nothing where there was no adjustment."""
+    if (sheet := sheet_of(context.estimate.figures)) is not None:
+        draw_sheet(sheet).savefig(context.aside("adjustment.png"), dpi=90, format="png")
 
-    Parameters
-    ----------
-    run : Run or CausalRun
-    given : Given
-    trajectory : Trajectory
-        Of the ins frame, as it is written.
-    """
-    track = run.track
-    knots_ns = boundaries_ns(track, run.motion)
-    begin_ns = int(knots_ns[0])
-    place = trajectory.after(begin_ns - 1).before(int(knots_ns[-1]))
-    moved, turned = np.zeros((0, 3)), np.zeros((0, 3))
-    if isinstance(run, Run):
-        quat, position_m = run.path.quat[::STEPS], run.path.position_m[::STEPS]
-        moved, turned = _changed(np.array(track.quat), np.array(track.position_m), quat, position_m)
-    offs = [_position_off(position_track(given, leg), run.path) for leg in given.placed]
-    attitudes = [a for leg in given.placed if (a := attitude_track(leg)) is not None]
-    headings = [_heading_off(a, run.path, run.mount(given.mount).mat_ins_lidar()) for a in attitudes]
-    report = run.report(given.mount)
-    compass = report.get("estimated", {}).get("compass_deg")
-    blind = float(np.mean(np.array(track.matched) < BLIND_BELOW))
-    log = run.windows[-1].log[-1] if isinstance(run, Run) else {}
-    parts = [f"{len(track) * 0.1:.0f} s", "causal" if isinstance(run, CausalRun) else f"{len(run.windows)} window(s)"]
-    parts += [f"{100.0 * blind:.0f} % without planes", f"{track.restarts} restarts"]
-    if run.is_worse():
+
+def sheet_of(figures: Mapping[str, npt.NDArray[Any]]) -> Sheet | None:
+    """The sheet among an estimate's figures; None where it has none."""
+    if "adjustment.slice_s" not in figures:
+        return None
+    return Sheet(**{each.name: figures[f"adjustment.{each.name}"] for each in fields(Sheet)})
+
+
+def title(sheet: Sheet) -> str:
+    """What stands above the picture."""
+    blind = float(np.mean(sheet.matched < BLIND_BELOW))
+    windows = int(sheet.windows)
+    parts = [f"{len(sheet.slice_s) * 0.1:.0f} s", f"{windows} window(s)" if windows else "causal"]
+    parts += [f"{100.0 * blind:.0f} % without planes", f"{int(sheet.restarts)} restarts"]
+    if sheet.is_worse:
         parts[3] += "; the trajectory is what the adjustment began from"
-    if log:
-        parts.append(f"lidar chi-square {log['chi_square']:.2f}")
-        parts += [
-            f"{k.removesuffix('_rms')} {v:.2f}" for k, v in log.items() if k.endswith("_rms") and k != "prior_rms"
-        ]
-    return Sheet(
-        ", ".join(parts[:4]) + ("\nresiduals in sigma, last round: " + ", ".join(parts[4:]) if log else ""),
-        np.asarray((knots_ns[1:] - begin_ns) * 1e-9),
-        np.array(track.matched, np.float64),
-        np.array(track.seen, np.float64),
-        np.array(track.residual_m, np.float64),
-        np.asarray((place.time_ns[::STEPS] - begin_ns) * 1e-9),
-        place.sigma_position_m[::STEPS],
-        place.sigma_attitude_rad[::STEPS],
-        moved,
-        turned,
-        (np.concatenate([t for t, _, _ in offs]) - begin_ns) * 1e-9,
-        np.concatenate([off for _, off, _ in offs]),
-        np.concatenate([sigma for _, _, sigma in offs]),
-        np.concatenate([h for h, _ in headings]) if headings else np.zeros(0),
-        np.concatenate([off for _, off in headings]) if headings else np.zeros(0),
-        None if compass is None else np.deg2rad(compass["value"]),
-        report.get("estimated", {}),
-    )
+    last = dict(zip(sheet.round_name.tolist(), sheet.round_value.tolist(), strict=True))
+    if not last:
+        return ", ".join(parts)
+    told = [f"lidar chi-square {last.pop('chi_square'):.2f}"]
+    told += [f"{name.removesuffix('_rms')} {value:.2f}" for name, value in last.items()]
+    return ", ".join(parts) + "\nresiduals in sigma, last round: " + ", ".join(told)
 
 
-def _changed(quat: Array, position_m: Array, final_quat: Array, final_position_m: Array) -> tuple[Array, Array]:
-    """Final poses less earlier ones that are turned and moved as a whole onto them: positions; rotations in the body."""
-    count = min(len(quat), len(final_quat))
-    quat, position_m = quat[:count], position_m[:count]
-    final_quat, final_position_m = final_quat[:count], final_position_m[:count]
-    total = (frames.mat_from_quat(final_quat) @ np.swapaxes(frames.mat_from_quat(quat), 1, 2)).sum(axis=0)
-    u, _, vt = np.linalg.svd(total)
-    mat = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    laid = position_m @ mat.T
-    laid += (final_position_m - laid).mean(axis=0)
-    turn = np.repeat(frames.quat_from_mat(mat[None]), count, axis=0)
-    return final_position_m - laid, frames.quat_log(
-        frames.quat_multiply(frames.quat_inverse(frames.quat_multiply(turn, quat)), final_quat)
-    )
-
-
-def _position_off(given: Positions, path: SensorPath) -> tuple[Array, Array, Array]:
-    """Times, stated positions less those of the path, and their sigmas."""
-    inside, node = _nodes(given.time_ns, path)
-    made = path.position_m[node] + frames.mat_from_quat(path.quat[node]) @ given.lever_m
-    return given.time_ns[inside].astype(np.float64), given.position_m[inside] - made, given.sigma_m[inside]
-
-
-def _heading_off(given: Attitudes, path: SensorPath, mat_ins_lidar: Array) -> tuple[Array, Array]:
-    """Headings of the path, and stated ones less them."""
-    inside, node = _nodes(given.time_ns, path)
-    made = frames.attitude_of(frames.mat_from_quat(path.quat[node]) @ mat_ins_lidar.T)[0]
-    stated = frames.attitude_of(frames.mat_from_quat(given.quat[inside]))[0]
-    return made % (2.0 * np.pi), (stated - made + np.pi) % (2.0 * np.pi) - np.pi
-
-
-def _nodes(time_ns: npt.NDArray[np.int64], path: SensorPath) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
-    """Which times lie on a path, and the nearest nodes of its grid to these."""
-    inside = (time_ns >= path.start_ns) & (time_ns <= path.start_ns + (len(path.quat) - 1) * STEP_NS)
-    return inside, np.rint((time_ns[inside] - path.start_ns) / STEP_NS).astype(np.int64)
-
-
-def draw_adjustment(path: Path, sheet: Sheet) -> None:
+def draw_sheet(sheet: Sheet) -> Figure:
     """Draw the sheet."""
-    rows = _table(sheet.estimated)
+    rows = _table(sheet)
     below = 0.1 + 0.21 * ((len(rows) + 1) // 2 + 1)  # inches of the table
     changed = 2.6 if len(sheet.moved_m) else 0.01
     figure = Figure(figsize=(13, 8.4 + changed + below), layout="constrained")
     grid = figure.add_gridspec(5, 2, height_ratios=[2.6, 2.6, changed, 2.6, below])
     axes = [[figure.add_subplot(grid[row, column]) for column in range(2)] for row in range(4)]
-    figure.suptitle(sheet.title, fontsize=10)
+    figure.suptitle(title(sheet), fontsize=10)
     _lines(axes[0][0], sheet.sigma_s, sheet.sigma_position_m, ("east", "north", "up"), "position sigma [m]")
     _lines(
         axes[0][1],
@@ -225,8 +165,7 @@ def draw_adjustment(path: Path, sheet: Sheet) -> None:
         axis.set_xlabel("time [s]")
     _draw_compass(axes[3][1], sheet)
     _draw_table(figure.add_subplot(grid[4, :]), rows)
-    with written_aside(path) as aside:
-        figure.savefig(aside, dpi=90, format="png")
+    return figure
 
 
 def _lines(axis: Axes, seconds: Array, values: Array, names: tuple[str, str, str], label: str) -> None:
@@ -251,7 +190,7 @@ def _draw_compass(axis: Axes, sheet: Sheet) -> None:
     axis.plot(
         np.rad2deg(sheet.heading_rad), np.rad2deg(sheet.heading_off_rad), **DOT, color="0.5", label="stated - path"
     )
-    if sheet.curve_rad is not None:
+    if len(sheet.curve_rad):
         at = np.linspace(0.0, 2.0 * np.pi, 181)
         terms = np.stack([np.ones_like(at), np.sin(at), np.cos(at), np.sin(2 * at), np.cos(2 * at)], axis=1)
         axis.plot(np.rad2deg(at), np.rad2deg(terms @ sheet.curve_rad), lw=1.5, color="C3", label="compass curve")
@@ -261,10 +200,11 @@ def _draw_compass(axis: Axes, sheet: Sheet) -> None:
     _finish(axis, "heading error [deg]")
 
 
-def _table(estimated: dict[str, Any]) -> list[tuple[list[str], bool]]:
+def _table(sheet: Sheet) -> list[tuple[list[str], bool]]:
     """Rows of text, one for each number, and whether it is held."""
     rows = []
-    for key, entry in estimated.items():
+    names = sheet.estimated_name.tolist()
+    for i, key in enumerate(names):
         last = key.rsplit(".", 1)[-1]
         base = next((n for n in sorted(UNITS_OF, key=len, reverse=True) if last == n or last.startswith(n + "_")), last)
         source = "autopilot" if key.startswith("ins.") else ("lidar's IMU" if key.startswith("lidar.") else "")
@@ -274,14 +214,13 @@ def _table(estimated: dict[str, Any]) -> list[tuple[list[str], bool]]:
             "shear": "cross-axis",
             "accel_turn": "accel misalignment",
         }.get(base, base)
-        factor = FACTORS.get(base, 1.0)
-        axes = AXES_OF.get(base, "").split() or [""] * len(entry["value"])
-        for axis, value, sigma, prior, held in zip(
-            axes, entry["value"], entry["sigma"], entry["prior_sigma"], entry["held"], strict=True
-        ):
-            numbers = [f"{factor * number:.3g}" if number else "0" for number in (value, sigma, prior)]
-            label = f"{name.replace('_', ' ')} {axis} [{UNITS_OF.get(base, '')}]"
-            rows.append(([source, label, *numbers, "held" if held else ""], bool(held)))
+        axes = AXES_OF.get(base, "").split() or [""]
+        axis = axes[(i - names.index(key)) % len(axes)]
+        numbers = (sheet.estimated_value[i], sheet.estimated_sigma[i], sheet.estimated_prior_sigma[i])
+        texts = [f"{FACTORS.get(base, 1.0) * number:.3g}" if number else "0" for number in numbers]
+        held = bool(sheet.estimated_held[i])
+        label = f"{name.replace('_', ' ')} {axis} [{UNITS_OF.get(base, '')}]"
+        rows.append(([source, label, *texts, "held" if held else ""], held))
     return rows
 
 

@@ -6,7 +6,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from groundproc.cloud.points import Points
 from groundproc.files import written_aside
+from groundproc.products.product import Context
 
 Array = npt.NDArray[np.float64]
 
@@ -19,10 +21,10 @@ class CloudSample:
     """A sample of a stream of points, evenly thinned, of bounded size."""
 
     def __init__(self) -> None:
-        self._parts: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]] = []
+        self._parts: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.unsignedinteger]]] = []
         self._step, self._size = 8, 0
 
-    def add(self, xyz_m: Array, intensity: npt.NDArray[np.uint8]) -> None:
+    def add(self, xyz_m: Array, intensity: npt.NDArray[np.unsignedinteger]) -> None:
         """Take every n-th of some points, shapes (n, 3) and (n,)."""
         # a step that shares no factor with the 32 lasers, so that none is preferred
         part = slice(None, None, self._step + 1)
@@ -33,10 +35,26 @@ class CloudSample:
             self._size = sum(len(xyz) for xyz, _ in self._parts)
             self._step *= 2
 
-    def points(self) -> tuple[Array, npt.NDArray[np.uint8]]:
+    def points(self) -> tuple[Array, npt.NDArray[np.unsignedinteger]]:
         """Positions, shape (n, 3), and intensities, shape (n,)."""
         xyz, intensity = zip(*self._parts, strict=True)
         return np.concatenate(xyz), np.concatenate(intensity)
+
+
+class Pictures:
+    """cloud_height.png and cloud_intensity.png."""
+
+    def begin(self, context: Context) -> None:
+        """Begin with no points."""
+        self._context, self._sample = context, CloudSample()
+
+    def add(self, points: Points) -> None:
+        """Keep some of the points."""
+        self._sample.add(points.xyz_m, points["intensity"])
+
+    def finish(self) -> None:
+        """Draw them."""
+        draw_cloud(self._context.folder, self._sample, self._context.projection.crs.name)
 
 
 def draw_cloud(folder: Path, sample: CloudSample, crs_name: str) -> None:

@@ -4,22 +4,22 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flightlog import nmea
 from flightlog.constants import HOUR_NS
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
-from groundproc.cloud import las
+from groundproc.cloud.points import Points
+from groundproc.cloud.writer import CloudWriter
 from groundproc.files import make_folder, written_aside
 from groundproc.flight import load, timebase
-from groundproc.flight.timebase import UtcTie
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors import identity as sensor_model
-from groundproc.sensors.hdl32e import Gate, Shots
+from groundproc.flight.lidar import lidar_of
+from groundproc.sensors.shots import Gate, Shots
+
+COLUMNS: Final = ("intensity", "return_number", "number_of_returns", "laser", "azimuth", "range")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,36 +47,40 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
             (s.device_time_ns, fix) for s in load.position_samples(readers).sentences if (fix := nmea.parse_rmc(s.text))
         ]
         tie = timebase.lidar_utc(fixes)
-        about = "sensor frame, GPS time" if tie else "sensor frame, sensor time"
+        lidar = lidar_of(readers)
+        tied = tie is not None or not lidar.stamp_wraps
+        about = f"{lidar.name} frame, {'GPS' if tied else 'sensor'} time"
         origin_ns: int | None = None
+        offset_ns = 0
         with (
             written_aside(output) as aside,
-            las.CloudWriter(aside, [las.LASER, las.AZIMUTH, las.RANGE], gps=tie is not None, about=about) as cloud,
+            CloudWriter(aside, COLUMNS, gps=tied, about=about) as cloud,
         ):
-            for batch in load.lidar_batches(readers, progress):
+            for batch in load.lidar_batches(readers, progress, lidar):
                 if not len(batch.packets):
                     continue
                 if origin_ns is None:
-                    sensor_model.refuse_other_models(batch.packets["data"], str(readers[0].path))
-                    origin_ns = int(batch.device_time_ns[0]) // HOUR_NS * HOUR_NS
-                for packets, time_ns in decode.by_mode(batch.packets, batch.device_time_ns):
-                    shots = decode.decode(packets, time_ns, gate)
-                    _write(cloud, shots, _seconds(shots.time_ns, origin_ns, tie))
+                    origin_ns = 0 if tied else int(batch.device_time_ns[0]) // HOUR_NS * HOUR_NS
+                    offset_ns = tie.offset_ns if tie else -origin_ns
+                for shots in lidar.decode(batch.packets, batch.device_time_ns, gate):
+                    cloud.write(points_of(shots, offset_ns))
             if origin_ns is None:
                 raise LogError(f"{readers[0].path}: no lidar packets in the log")
             if not cloud.points:
                 raise LogError(f"{readers[0].path}: no return within the field of view and the range gate")
-    return SensorCloud(cloud.points, "GPS time" if tie else "sensor time in seconds past the hour of the first packet")
+    return SensorCloud(cloud.points, "GPS time" if tied else "sensor time in seconds past the hour of the first packet")
 
 
-def _seconds(time_ns: npt.NDArray[np.int64], origin_ns: int, tie: UtcTie | None) -> npt.NDArray[np.float64]:
-    """What stands in the file for lidar times [ns]: GPS time, or seconds since an origin."""
-    if tie is None:
-        return np.asarray((time_ns - origin_ns) * 1e-9, np.float64)
-    return las.gps_time_s(time_ns + tie.offset_ns)
-
-
-def _write(cloud: las.CloudWriter, shots: Shots, seconds: npt.NDArray[np.float64]) -> None:
-    azimuth = np.rint(shots.azimuth_cdeg).astype(np.uint16) % 36_000
-    extras: dict[str, npt.NDArray[Any]] = {"laser": shots.laser, "azimuth": azimuth, "range": shots.range_steps}
-    cloud.write(shots.xyz_m, seconds, shots.intensity, shots.returns, extras)
+def points_of(shots: Shots, offset_ns: int) -> Points:
+    """Shots as points of the sensor's own frame, an offset added to their times."""
+    azimuth_cdeg = np.rint(np.rad2deg(shots.azimuth_rad.astype(np.float64)) * 100.0)
+    columns = {
+        "intensity": shots.intensity,
+        "return_number": shots.returns & 0x0F,
+        "number_of_returns": shots.returns >> 4,
+        "laser": shots.laser,
+        # the last hundredth of a turn is rounded up to a whole one, which is 0
+        "azimuth": (azimuth_cdeg % 36_000 * 0.01).astype(np.float32),
+        "range": shots.range_m,
+    }
+    return Points(shots.time_ns + offset_ns, shots.xyz_m.astype(np.float64), columns)

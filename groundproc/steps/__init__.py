@@ -1,1 +1,13 @@
-"""The flight from logs to products."""
+"""The flight from logs to products, step by step.
+
+Each step is a file that says what it reads, which settings it looks at, and what it does (`step.Step`). What was made of what stands in the
+ledger of the output folder (`ledger.Ledger`), so that a second run does only what changed, and an interrupted one goes on.
+
+log --clocks--> one time scale --trajectory--> estimate --place--> points and products --quality--> quality.json
+estimate, quality.json --products--> pictures and tables
+"""
+
+from typing import Final
+
+ORDER: Final = ("clocks", "trajectory", "place", "quality", "products")
+"""The steps, each a module of this package with a `STEP`."""

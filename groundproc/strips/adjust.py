@@ -8,16 +8,15 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from groundproc.estimation.adjustment.batch import DEFLATION
-from groundproc.estimation.adjustment.factors import Factor, Unknowns
+from groundproc.estimation.observations.lidar import DEFLATION
+from groundproc.estimation.observations.rows import Factor, Unknowns
+from groundproc.numerics.splines import AT_KNOT
 from groundproc.strips.correction import Correction
 from groundproc.strips.options import AUTO, FREE, StripOptions
 from groundproc.strips.rows import ROUGHNESS_M, Bordered, bordered
 
 Array = npt.NDArray[np.float64]
 
-AT_KNOT: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
-"""Weights of a uniform cubic B-spline at a knot."""
 MOST_INTERVALS: Final = 660
 """Intervals between knots: 4000 unknowns, a matrix of 128 MB. Longer flights get knots farther apart."""
 COARSEST_M: Final = 16.0

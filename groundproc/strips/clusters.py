@@ -1,7 +1,7 @@
 """Points to clusters: what was seen of one voxel within a tenth of a second; a bounded number of them, whatever the cloud."""
 
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,8 @@ from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Singles = npt.NDArray[np.float32]
+Numbers = npt.NDArray[np.int32]
 
 CLUSTER: Final = np.dtype(
     [
@@ -60,9 +62,11 @@ class Gatherer:
         order = order[np.argsort(keys[order], kind="stable")]
         out = np.zeros(len(order), CLUSTER)
         found = _gather(
-            order, keys, time_ns, xyz_m, sensor_m, quat, strip, out["time_ns"], out["place"], out["arm"], out["quat"],
-            out["scatter"], out["count"], out["strip"],
-        )  # fmt: skip
+            order,
+            keys,
+            _Points(time_ns, xyz_m, sensor_m, quat, strip),
+            _Columns(*(out[name] for name in CLUSTER.names or ())),
+        )
         self._parts.append(out[:found].copy())
         self._held += found
         self.total += found
@@ -114,7 +118,7 @@ _SIX: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @njit(cache=True, nogil=True)
-def _hashes(place: Any, voxel_m: float) -> Any:
+def _hashes(place: Array, voxel_m: float) -> Any:
     out = np.empty(len(place), np.int64)
     for i in range(len(place)):
         out[i] = spread(voxel_key(place[i, 0], place[i, 1], place[i, 2], 1.0 / (COARSE * voxel_m)))
@@ -122,7 +126,7 @@ def _hashes(place: Any, voxel_m: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _keys(split: Any, xyz: Any, voxel_m: float, below: int) -> Any:
+def _keys(split: Ints, xyz: Array, voxel_m: float, below: int) -> Any:
     """A key for each point's voxel and split, and the points whose voxels are kept."""
     keys, kept, count = np.empty(len(split), np.int64), np.empty(len(split), np.int64), 0
     for i in range(len(split)):
@@ -141,11 +145,33 @@ def _keys(split: Any, xyz: Any, voxel_m: float, below: int) -> Any:
     return keys, kept[:count]
 
 
+class _Points(NamedTuple):
+    """Points, and where and how they were seen from; shapes (n,), (n, 3), (n, 3), (n, 4), (n,). See `Gatherer.add`."""
+
+    time_ns: Ints
+    xyz_m: Array
+    sensor_m: Array
+    quat: Array
+    strip: Numbers
+
+
+class _Columns(NamedTuple):
+    """Columns of clusters to be filled in: of CLUSTER, in its order, and described there; scatter is zero before."""
+
+    time_ns: Ints
+    place_m: Array
+    arm_m: Singles
+    quat: Singles
+    scatter_m2: Singles
+    points: Numbers
+    strip: Numbers
+
+
 @njit(cache=True, nogil=True)
-def _gather(
-    order: Any, keys: Any, time_ns: Any, xyz: Any, sensor: Any, quat: Any, strip: Any, out_time: Any, out_place: Any, out_arm: Any,
-    out_quat: Any, out_scatter: Any, out_count: Any, out_strip: Any,
-) -> int:  # fmt: skip
+def _gather(order: Ints, keys: Ints, points: _Points, out: _Columns) -> int:
+    """Clusters of points with the same key, which follow each other in `order`; gives how many there are."""
+    time_ns, xyz, sensor, quat, strip = points
+    out_time, out_place, out_arm, out_quat, out_scatter, out_count, out_strip = out
     found, at = 0, 0
     while at < len(order):
         first, end = order[at], at + 1

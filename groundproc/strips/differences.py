@@ -1,13 +1,14 @@
 """What overlapping strips differ by: two planes of one voxel, one of each strip, along their normal."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.numerics.rotations import flattest
+from groundproc.numerics import robust
+from groundproc.numerics.planes import flattest_of
 from groundproc.strips.clusters import Gatherer
 
 Array = npt.NDArray[np.float64]
@@ -52,13 +53,30 @@ class Patches:
         cells, index = cells[order], index[order]
         new = np.ones(len(cells) + 1, np.bool_)
         new[1:-1] = (np.diff(index, axis=0) != 0).any(axis=1)
-        args = (np.flatnonzero(new), cells["place"], cells["scatter"], cells["count"], cells["strip"], self.voxel_m)
-        none = np.empty((0, 8)), np.empty((0, 2), np.int32)
-        count = _pairs(*args, *none, False)
+        planes = _Planes(cells["place"], cells["scatter"], cells["count"], cells["strip"])
+        first = np.flatnonzero(new)
+        count = _pairs(first, planes, self.voxel_m, np.empty((0, 8)), np.empty((0, 2), np.int32))
         value, strips = np.empty((count, 8)), np.empty((count, 2), np.int32)
-        _pairs(*args, value, strips, True)
+        _pairs(first, planes, self.voxel_m, value, strips)
         value[:, 4:7] -= 0.5 * self.voxel_m
         return Differences(value[:, 0], value[:, 1:4], value[:, 4:7], value[:, 7], strips)
+
+
+class _Planes(NamedTuple):
+    """Points of one voxel and strip, those of a voxel after each other.
+
+    Attributes
+    ----------
+    place_m : ndarray, shape (n, 3)
+        Their mean.
+    scatter_m2 : ndarray of float32, shape (n, 6)
+    points, strip : ndarray of int32, shape (n,)
+    """
+
+    place_m: Array
+    scatter_m2: npt.NDArray[np.float32]
+    points: npt.NDArray[np.int32]
+    strip: npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,14 +134,14 @@ class Differences:
 
 
 def figures(value: Array) -> dict[str, Any]:
-    """Count, median, sigmaMAD (1.4826 times the median distance from the median), the median magnitude, and RMS."""
+    """Count, median, sigmaMAD (`numerics.robust`), the median magnitude, and RMS."""
     if not len(value):
         return {"count": 0, "median_m": None, "sigma_mad_m": None, "median_abs_m": None, "rms_m": None}
     median = float(np.median(value))
     return {
         "count": len(value),
         "median_m": _rounded(median),
-        "sigma_mad_m": _rounded(1.4826 * np.median(np.abs(value - median))),
+        "sigma_mad_m": _rounded(robust.sigma(value, median)),
         "median_abs_m": _rounded(np.median(np.abs(value))),
         "rms_m": _rounded(np.sqrt(np.mean(np.square(value)))),
     }
@@ -134,11 +152,10 @@ def _rounded(value: Any) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _pairs(
-    first: Any, place: Any, scatter: Any, count: Any, strip: Any, voxel_m: float, value: Any, strips: Any, fill: bool
-) -> int:
-    """Count pairs of planes of one voxel, and fill them in: difference, normal, place, sigma."""
-    found = 0
+def _pairs(first: Ints, planes: _Planes, voxel_m: float, value: Array, strips: npt.NDArray[np.int32]) -> int:
+    """Count pairs of planes of one voxel, and fill them in where there is room: difference, normal, place, sigma."""
+    place, scatter, count, strip = planes.place_m, planes.scatter_m2, planes.points, planes.strip
+    found, fill = 0, len(value) > 0
     normals, low = np.empty((_MOST, 3)), np.empty(_MOST)
     for v in range(len(first) - 1):
         start, end = first[v], min(first[v + 1], first[v] + _MOST)
@@ -161,22 +178,20 @@ def _pairs(
 
 
 @njit(cache=True, nogil=True)
-def _thickness(scatter: Any, count: int, voxel_m: float, normal: Any) -> Any:
+def _thickness(scatter: npt.NDArray[np.float32], count: int, voxel_m: float, normal: Array) -> Any:
     """Variance across the plane of some points; negative where they are too few or no plane. `normal` takes its direction."""
     if count < FEWEST:
         normal[:] = 0.0
         return -1.0
     n = 1.0 / count
-    least, middle = flattest(
-        n * scatter[0], n * scatter[1], n * scatter[2], n * scatter[3], n * scatter[4], n * scatter[5], normal
-    )
+    least, middle = flattest_of(scatter, n, normal)
     if least < (0.04 + 0.02 * voxel_m) ** 2 and middle > (0.15 * voxel_m) ** 2 and least < 0.15 * middle:
         return max(least, 1e-8)
     return -1.0
 
 
 @njit(cache=True, nogil=True)
-def _difference(normal: Any, other: Any, sign: float, place: Any, later: Any, out: Any) -> None:
+def _difference(normal: Array, other: Array, sign: float, place: Array, later: Array, out: Array) -> None:
     """Way from a plane to a later one along their mean normal, which points up or, of walls, east; and the middle between them."""
     x, y, z = normal[0] + sign * other[0], normal[1] + sign * other[1], normal[2] + sign * other[2]
     length = np.sqrt(x * x + y * y + z * z)

@@ -7,7 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.strips.clouds import Chunk, Clock, Cloud
+from groundproc.cloud.gpstime import Clock
+from groundproc.cloud.reader import Cloud
+from groundproc.strips.clouds import Chunk
 from groundproc.strips.options import StripOptions
 from groundproc.strips.route import Route
 

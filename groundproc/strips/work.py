@@ -12,10 +12,11 @@ import pyproj
 
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError, SwathError, UsageError
+from groundproc.cloud.gpstime import Clock
 from groundproc.files import made_folder
 from groundproc.strips import report
 from groundproc.strips.adjust import COARSEST_M, MOST_INTERVALS, Adjusted, Sigmas, adjust
-from groundproc.strips.clouds import Clock, agreed_crs, chunks, look, rewriters
+from groundproc.strips.clouds import agreed_crs, chunks, look, rewriters
 from groundproc.strips.clusters import CLUSTER, Gatherer
 from groundproc.strips.control import as_clusters, read_control
 from groundproc.strips.correction import Correction

@@ -8,7 +8,7 @@ bad knot disturbs its two neighbours and nothing else.
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from numba import njit
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.geodesy import LocalFrame
+from groundproc.numerics.rotations import quat_difference, quat_turned
+from groundproc.trajectory.covariance import Correlation, chained, scaled, uncorrelated
 
 Array = npt.NDArray[np.float64]
 
@@ -62,6 +64,8 @@ class Trajectory:
         Whether the interval from each knot to the next is covered; False for the last.
     interpolation : str
         "cubic", or "hold": the nearest knot's pose, as the source does on its 10 ms grid.
+    correlation : Correlation, optional
+        Of the six errors of a pose, at knots of its own; None: they are taken to be independent.
     """
 
     frame: LocalFrame
@@ -74,6 +78,7 @@ class Trajectory:
     sigma_attitude_rad: Array
     covered: npt.NDArray[np.bool_]
     interpolation: str = SMOOTH
+    correlation: Correlation | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -83,7 +88,10 @@ class Trajectory:
         arrays = {name: getattr(self, name)[chosen] for name in _ARRAYS}
         covered = arrays["covered"].copy()
         covered[-1:] = False
-        return replace(self, **arrays | {"covered": covered})
+        correlation, time_ns = self.correlation, arrays["time_ns"]
+        if correlation is not None and len(time_ns):
+            correlation = correlation.between(int(time_ns[0]), int(time_ns[-1]))
+        return replace(self, **arrays | {"covered": covered}, correlation=correlation)
 
     def before(self, time_ns: int) -> "Trajectory":
         """The knots up to a time [ns]."""
@@ -101,19 +109,10 @@ class Trajectory:
         times = np.ascontiguousarray(time_ns, np.int64)
         position, quat = np.empty((len(times), 3)), np.empty((len(times), 4))
         covered = np.zeros(len(times), np.bool_)
-        _interpolate(
-            self.time_ns,
-            self.covered,
-            self.position_m,
-            self.velocity_m_s,
-            self.quat_local_ins_wxyz,
-            self.rate_rad_s,
-            self.interpolation == HOLD,
-            times,
-            position,
-            quat,
-            covered,
+        knots = _Knots(
+            self.time_ns, self.covered, self.position_m, self.velocity_m_s, self.quat_local_ins_wxyz, self.rate_rad_s
         )
+        _interpolate(knots, self.interpolation == HOLD, times, position, quat, covered)
         return Poses(position, quat), covered
 
     def at(self, time_ns: npt.NDArray[np.int64]) -> Poses:
@@ -132,6 +131,32 @@ class Trajectory:
                 f"{utc_text(int(self.time_ns[-1]))}, less its gaps"
             )
         return poses
+
+    def covariance_at(self, time_ns: npt.NDArray[np.int64]) -> Array:
+        """Covariance of poses at times, shape (n, 6, 6): east, north, up [m], roll, pitch, heading [rad].
+
+        Sigmas and correlations are interpolated linearly (see `covariance`); a sigma that nobody stated makes its row and column
+        not-a-number.
+
+        Raises
+        ------
+        CoverageError
+            A time before the first knot or after the last.
+        """
+        times = np.asarray(time_ns, np.int64)
+        outside = (times < self.time_ns[0]) | (times > self.time_ns[-1])
+        if outside.any():
+            raise CoverageError(
+                f"trajectory: no covariance at {utc_text(int(times[outside][0]))}; it covers {utc_text(int(self.time_ns[0]))} to "
+                f"{utc_text(int(self.time_ns[-1]))}"
+            )
+        seconds, knots_s = (times - self.time_ns[0]) * 1e-9, (self.time_ns - self.time_ns[0]) * 1e-9
+        position, attitude = (
+            np.stack([np.interp(seconds, knots_s, column) for column in sigma.T], axis=1)
+            for sigma in (self.sigma_position_m, self.sigma_attitude_rad)
+        )
+        matrix = uncorrelated(times).matrix if self.correlation is None else self.correlation.at(times)
+        return scaled(matrix, position, attitude)
 
 
 _ARRAYS: Final = (
@@ -157,23 +182,41 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
                 f"{utc_text(int(second.time_ns[0]))}, expected later"
             )
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
-    return replace(parts[0], **arrays)
+    return replace(parts[0], **arrays, correlation=_correlation_of(parts))
+
+
+def _correlation_of(parts: Sequence[Trajectory]) -> Correlation | None:
+    """The correlations of parts that follow each other; None where no part has any."""
+    if all(part.correlation is None for part in parts):
+        return None
+    return chained(
+        [
+            uncorrelated(part.time_ns[[0, -1]])
+            if part.correlation is None
+            else part.correlation.between(int(part.time_ns[0]), int(part.time_ns[-1]))
+            for part in parts
+        ]
+    )
+
+
+class _Knots(NamedTuple):
+    """Knots of a `Trajectory` as the kernel takes them; the fields stand there."""
+
+    time_ns: npt.NDArray[np.int64]
+    covered: npt.NDArray[np.bool_]
+    position_m: Array
+    velocity_m_s: Array
+    quat: Array
+    rate_rad_s: Array
 
 
 @njit(cache=True, nogil=True)
 def _interpolate(
-    knots: Any,
-    covered: Any,
-    position: Any,
-    velocity: Any,
-    quat: Any,
-    rate: Any,
-    hold: bool,
-    times: Any,
-    out_position: Any,
-    out_quat: Any,
-    out_covered: Any,
-) -> None:
+    trajectory: _Knots, hold: bool, times: npt.NDArray[np.int64], out_position: Array, out_quat: Array,
+    out_covered: npt.NDArray[np.bool_],
+) -> None:  # fmt: skip
+    knots, covered, quat, rate = trajectory.time_ns, trajectory.covered, trajectory.quat, trajectory.rate_rad_s
+    position, velocity = trajectory.position_m, trajectory.velocity_m_s
     last = len(knots) - 2
     i = -1
     delta, slope, vector = np.empty(3), np.empty(3), np.empty(3)
@@ -187,7 +230,7 @@ def _interpolate(
                 i += 1
             else:
                 i = min(max(np.searchsorted(knots, t, side="right") - 1, 0), last)
-            _relative_rotation(quat[i], quat[i + 1], delta)
+            quat_difference(quat[i], quat[i + 1], delta)
             # rate of the rotation vector at the end: the inverse right Jacobian, to second order in the step
             w = rate[i + 1]
             slope[0] = w[0] + 0.5 * (delta[1] * w[2] - delta[2] * w[1])
@@ -213,35 +256,4 @@ def _interpolate(
                 + h11 * velocity[i + 1, axis]
             )
             vector[axis] = h01 * delta[axis] + h10 * rate[i, axis] + h11 * slope[axis]
-        _rotate_on(quat[i], vector, out_quat[k])
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _relative_rotation(q: Any, r: Any, out: Any) -> None:
-    """Rotation vector from attitude q to attitude r, in the body of q: log(q^-1 r), the short way."""
-    w = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
-    x = q[0] * r[1] - q[1] * r[0] - q[2] * r[3] + q[3] * r[2]
-    y = q[0] * r[2] + q[1] * r[3] - q[2] * r[0] - q[3] * r[1]
-    z = q[0] * r[3] - q[1] * r[2] + q[2] * r[1] - q[3] * r[0]
-    sine = np.sqrt(x * x + y * y + z * z)
-    factor = 2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, abs(w)) / sine
-    if w < 0:
-        factor = -factor
-    out[0], out[1], out[2] = factor * x, factor * y, factor * z
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _rotate_on(q: Any, vector: Any, out: Any) -> None:
-    """Attitude q turned on by a rotation vector in its body: q exp(vector)."""
-    square = 0.25 * (vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    if square < 0.01:  # half angles under 0.1 rad: five terms are exact to 1e-16
-        w = 1 - square / 2 * (1 - square / 12 * (1 - square / 30 * (1 - square / 56)))
-        factor = 0.5 * (1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72))))
-    else:
-        half = np.sqrt(square)
-        w, factor = np.cos(half), 0.5 * np.sin(half) / half
-    x, y, z = factor * vector[0], factor * vector[1], factor * vector[2]
-    out[0] = q[0] * w - q[1] * x - q[2] * y - q[3] * z
-    out[1] = q[0] * x + q[1] * w + q[2] * z - q[3] * y
-    out[2] = q[0] * y - q[1] * z + q[2] * w + q[3] * x
-    out[3] = q[0] * z + q[1] * y - q[2] * x + q[3] * w
+        quat_turned(quat[i], vector[0], vector[1], vector[2], out_quat[k])

@@ -16,11 +16,12 @@ from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
 from groundproc.estimation.adjustment import adjusted, windows
-from groundproc.estimation.method import Estimate, gather
+from groundproc.estimation.method import gather
 from groundproc.estimation.odometry.track import Track
 from groundproc.flight.flight import read_flight
 from groundproc.flight.timeline import legs
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 SECONDS = 20.0
 DRAWS = 12
@@ -64,7 +65,8 @@ def judged(folder: Path, survey: Survey, log: Path | None = None, *, cloud: bool
         given = gather([reader], read, timeline, truth.nominal_mount, survey)
         made = methods.estimate(given, lambda stage, size: None)
         placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
-        found = judge([reader] if cloud else [], truth, placed, made.mount, made.lasers)
+        lasers = made.corrections.table(read.lidar.lasers)
+        found = judge([reader] if cloud else [], truth, placed, made.mount, lasers)
     return Judged(made, found.figures, given.fixes[0].sigma_m.max(axis=0))
 
 

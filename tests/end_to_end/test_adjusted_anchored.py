@@ -20,10 +20,11 @@ from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth
 from groundproc.cli import main
 from groundproc.estimation import methods
 from groundproc.estimation.adjustment import adjusted, windows
-from groundproc.estimation.method import Estimate, Given, gather
+from groundproc.estimation.method import Given, gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.timeline import legs
 from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate
 
 Array = npt.NDArray[np.float64]
 SECONDS = 20.0
@@ -65,6 +66,7 @@ def made(folder: Path, survey: Survey) -> Made:
     truth = read_truth(folder)
     with given_of(truth, survey) as given:
         estimate = methods.estimate(given, lambda stage, size: None)
+        lasers = estimate.corrections.table(given.lidar.lasers)
         found = on_lidar_clock(estimate.trajectory, given.timeline[0].lidar_line, truth)
     true, covered = truth.trajectory.where_covered(found.time_ns)
     mat, mat_true = (
@@ -73,7 +75,7 @@ def made(folder: Path, survey: Survey) -> Made:
     place = found.position_m[covered] + mat @ estimate.mount.lidar_position_m()
     place_true = true.position_m[covered] + mat_true @ truth.mount.lidar_position_m()
     turn = mat @ estimate.mount.mat_ins_lidar() @ np.swapaxes(mat_true @ truth.mount.mat_ins_lidar(), 1, 2)
-    figures = judge([], truth, found, estimate.mount, estimate.lasers).figures
+    figures = judge([], truth, found, estimate.mount, lasers).figures
     sigma = found.sigma_position_m[covered]
     return Made(
         estimate, place - place_true, sigma, frames.quat_log(frames.quat_from_mat(turn)), float(figures["ate_m"])

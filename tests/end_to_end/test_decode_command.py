@@ -11,7 +11,8 @@ import velodyne_decoder
 from flightlog.logfile import LogReader
 from groundproc.cli import main
 from groundproc.flight import load
-from groundproc.sensors.hdl32e import Gate, decode
+from groundproc.sensors import hdl32e as model
+from groundproc.sensors.shots import Gate
 
 
 def run(output: Path, *words: Any) -> laspy.LasData:
@@ -70,11 +71,11 @@ def test_without_gps_times_are_the_sensors_own(
     packets = np.concatenate([b.packets for b in batches])
     # on from 1012.25 s past the hour, by the bytes themselves
     sent_ns = packets["data"]["stamp_us"].astype(np.int64) * 1000
-    shots = decode(packets, sent_ns, Gate(0.0, 360.0, 2.0, 40.0))
+    (shots,) = model.LIDAR.decode(packets, sent_ns, Gate(0.0, 360.0, 2.0, 40.0))
     np.testing.assert_allclose(np.asarray(cloud.gps_time), shots.time_ns * 1e-9, atol=1e-8)
     np.testing.assert_allclose(xyz(cloud), shots.xyz_m, atol=0.00051)
     assert (np.asarray(cloud["laser"]) == shots.laser).all()
-    away = (np.asarray(cloud["azimuth"]) - shots.azimuth_cdeg * 0.01 + 180.0) % 360.0 - 180.0
+    away = (np.asarray(cloud["azimuth"]) - np.rad2deg(shots.azimuth_rad) + 180.0) % 360.0 - 180.0
     assert np.abs(away).max() < 0.0051
     ranges = np.asarray(cloud["range"])
     assert 2.0 <= ranges.min() <= ranges.max() <= 40.0

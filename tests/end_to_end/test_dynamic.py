@@ -11,9 +11,10 @@ import pytest
 import yaml
 
 from groundproc.cli import main
+from groundproc.trajectory.estimate import FILES
 
 PRODUCTS = {
-    "cloud.laz", "trajectory.csv", "quality.json", "cloud_height.png", "cloud_intensity.png", "trims.csv", "trims.png",
+    "cloud.laz", "quality.json", "cloud_height.png", "cloud_intensity.png", "trims.csv", "trims.png", *FILES,
 }  # fmt: skip
 ERROR_DEG = 5.0
 

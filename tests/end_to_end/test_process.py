@@ -19,9 +19,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from flightlog import records
 from flightlog.logfile import LogReader, LogWriter
 from groundproc.cli import main
+from groundproc.trajectory.estimate import FILES
 
 Array = npt.NDArray[np.float64]
-PRODUCTS = {"cloud.laz", "trajectory.csv", "quality.json", "cloud_height.png", "cloud_intensity.png"}
+PRODUCTS = {"cloud.laz", "quality.json", "cloud_height.png", "cloud_intensity.png", *FILES}
+LEDGER = ".swath"
 RANGE_NOISE_M = 0.015
 """What the simulation puts into every range (1 sigma)."""
 LEAP_S = 18
@@ -50,7 +52,7 @@ class Processed:
 def process(folder: Path, *words: Any, method: str = "ins") -> Processed:
     """Products by the autopilot's own solution where nothing else is said: these tests are about the chain."""
     assert main(["process", *(str(word) for word in words), "--method", method, "-o", str(folder)]) == 0
-    assert {path.name for path in folder.iterdir()} - {"adjustment.png"} == PRODUCTS
+    assert {path.name for path in folder.iterdir()} - {"adjustment.png"} == PRODUCTS | {LEDGER} | set(FILES)
     return Processed(folder)
 
 

@@ -23,8 +23,11 @@ def generate() -> ModuleType:
     return module
 
 
-def test_the_page_of_the_log_format_is_what_the_table_says_now(generate: ModuleType) -> None:
-    assert (DOCS / "log-format.md").read_text(encoding="utf-8") == generate.page()
+@pytest.mark.parametrize(
+    "page", ["log-format.md", "dimensions.md", "products.md", "survey.md", "methods/observations.md"]
+)
+def test_a_page_is_what_its_table_says_now(generate: ModuleType, page: str) -> None:
+    assert (DOCS / page).read_text(encoding="utf-8") == generate.PAGES[page]()
 
 
 Fields = list[tuple[str, str, str]]

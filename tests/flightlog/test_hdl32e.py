@@ -202,6 +202,7 @@ def test_the_position_packets_of_a_vlp16_carry_no_gyros(vlp16_position: Packets)
         (manual_packet(mode=0x36), PacketError, "return mode 0x36"),
         (manual_packet(mode=0), PacketError, "return mode 0x00"),
         (manual_packet(product=0x28), WrongSensorError, "VLP-32C"),
+        (b"\xff\xdd" + manual_packet()[2:], WrongSensorError, "HDL-64E"),
         (manual_packet(product=0xA1), WrongSensorError, "VLS-128"),
         (manual_packet(product=0x77), WrongSensorError, "0x77 is an unknown sensor"),
     ],

@@ -5,7 +5,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.estimation.adjustment.factors import Factor, Unknowns, prior_factor
+from groundproc.estimation.observations.rows import Errors, Factor, Unknowns, prior_factor
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
@@ -64,6 +64,6 @@ def factors_of(unknowns: Unknowns) -> list[Factor]:
         place[axis, 6 * 30 + 3 + axis] = place[axis, unknowns.names["world.shift"].start + axis] = 1.0
     return [
         Factor("increments", np.zeros(size), turns.tocsr(), sigma),
-        Factor("position", np.ones(3), place.tocsr(), np.full(3, 2.0)),
-        prior_factor(unknowns, {}),
+        Factor("position", np.ones(3), place.tocsr(), np.full(3, 2.0), errors=Errors.ANCHOR),
+        prior_factor(unknowns),
     ]

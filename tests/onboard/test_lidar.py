@@ -166,6 +166,21 @@ def test_a_recorded_vlp16_is_told_by_name_and_never_reaches_the_log(vlp16_data: 
     assert session.port.counts.newest_ns == 0  # no sign of an HDL-32E
 
 
+def test_an_hdl64e_is_told_by_name_and_never_reaches_the_log(monterey_data: list[bytes]) -> None:
+    """Its packets are as long, have no product byte, and flag the blocks of its lower lasers with FF DD."""
+    taller = []
+    for payload in monterey_data[:40]:
+        blocks = bytearray(payload)
+        for block in range(1, 12, 2):
+            blocks[100 * block : 100 * block + 2] = b"\xff\xdd"
+        taller.append(bytes(blocks[:1204]) + b"\x48\x0a")  # status type and value in place of mode and product
+    session = Session()
+    session.send(taller)
+    assert session.of(records.LIDAR.topic) == []
+    assert session.port.counts.rejected == {"data packet of another sensor: HDL-64E": 40}
+    assert session.port.counts.newest_ns == 0  # no sign of an HDL-32E
+
+
 def test_a_batch_spans_about_a_tenth_of_a_second(monterey_data: list[bytes]) -> None:
     session = Session()
     session.port.start()

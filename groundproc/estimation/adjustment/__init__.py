@@ -1,14 +1,15 @@
 """The adjustment: lidar, inertial sensors and GNSS in one least-squares problem over the flight (method `adjusted`).
 
-It begins from the path and the clusters of `odometry`.
+It begins from the path and the clusters of `odometry`; what each source of measurements says is in `observations`.
 
-planes      what the lidar says, with the planes solved for within; lasers: each laser's own offsets with them
-factors     what everything else says; anchors, outside: what ties the path to the earth
-control     surveyed points and planes; surfaces: the map where they lie; datum: the map laid on them as a whole
 coarse      slow bends, the preconditioner's second level
 solve       one Gauss-Newton step by conjugate gradients
 noise       where errors come from, for the sigmas
-batch       all of them, and the posterior
+posterior   what a solution knows of itself; poses: covariance of the path's poses
+batch       all observations of a stretch of the flight, adjusted
 windows     of a long flight; patches: the ground that several saw; joining: one adjustment over them all
+run         a run of the lidar's clock once it is adjusted; causal: by the odometry alone; sensorpath: from the sensor to the ins frame
+figures     arrays that pictures are drawn from
+pace        progress
 adjusted    the method
 """

@@ -8,7 +8,7 @@ space holds the rigid motions, as that of smoothed aggregation does (Vanek, Mand
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,15 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from flightlog import frames
-from groundproc.estimation.adjustment.planes import Rows
+from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics import splines
+from groundproc.numerics.planerows import RowArrays, solved_plane
 
 Array = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
 
 EVERY: Final = 16
 """Coefficients from node to node, at least: 1.6 s."""
@@ -31,6 +35,15 @@ LEAST_SHARE: Final = 1e-3
 """Of all that is known of a direction."""
 COARSE_PARTS: Final = 4
 """Pieces that the voxels are shared out in between cores, each with a matrix of its own."""
+
+
+class NodeArrays(NamedTuple):
+    """`Nodes` as kernels take them; the fields stand there."""
+
+    every: int
+    mats: Array
+    position_m: Array
+    centre_m: Array
 
 
 @dataclass(slots=True)
@@ -53,14 +66,19 @@ class Nodes:
     position_m: Array
     centre_m: Array
 
+    @property
+    def arrays(self) -> NodeArrays:
+        """What the kernels take."""
+        return NodeArrays(self.every, self.mats, self.position_m, self.centre_m)
+
     @classmethod
     def of(cls, path: Path) -> "Nodes":
         """Nodes for a path."""
         count = path.intervals + 3
         every = max(EVERY, -(-count // MOST_NODES))
         nodes = -(-(count - 1) // every) + 1
-        position = _coefficients(path.position_m[::STEPS])
-        mats = _coefficients(frames.mat_from_quat(path.quat[::STEPS]))
+        position = splines.through(path.position_m[::STEPS])
+        mats = splines.through(frames.mat_from_quat(path.quat[::STEPS]))
         return cls(every, mats, position, position[np.minimum(np.arange(nodes) * every, count - 1)])
 
     def prolongation(self) -> sparse.csr_matrix:
@@ -89,13 +107,6 @@ class Nodes:
         motion = np.tile(np.eye(6), (count, 1, 1))
         motion[:, 3:, :3] = np.cross(np.eye(3), self.centre_m[:, None]).swapaxes(1, 2)
         return np.asarray(prolongation @ motion.reshape(6 * count, 6))
-
-
-def _coefficients(values: Array) -> Array:
-    """Coefficients of the spline through values at the knots, shape (intervals + 1, ...), cubics exactly; straight beyond the ends."""
-    for _ in range(2):
-        values = np.concatenate([2.0 * values[:1] - values[1:2], values, 2.0 * values[-1:] - values[-2:-1]])
-    return np.asarray(values[1:-1] - (values[2:] - 2.0 * values[1:-1] + values[:-2]) / 6.0)
 
 
 @dataclass(slots=True)
@@ -155,63 +166,60 @@ def lidar_between(rows: Rows, nodes: Nodes) -> Array:
     """The lidar's normal matrix between nodes, shape (6 nodes, 6 nodes)."""
     count = len(nodes.centre_m)
     upper = np.zeros((COARSE_PARTS, count, count, 6, 6))
-    _reduce(
-        rows.first, rows.knot, rows.weights, rows.jacobian, rows.plane, rows.weight, rows.inverse, nodes.every, nodes.mats,
-        nodes.position_m, nodes.centre_m, upper,
-    )  # fmt: skip
+    _reduce(rows.arrays, nodes.arrays, upper)
     upper[0] += upper[1:].sum(axis=0)
     square = upper[0].transpose(0, 2, 1, 3).reshape(6 * count, 6 * count)
     return np.asarray(np.triu(square) + np.triu(square, 1).T)
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _reduce(
-    first: Any, knot: Any, weights: Any, jacobian: Any, plane: Any, weight: Any, inverse: Any, every: int, mats: Any, position: Any,
-    centre: Any, out: Any,
-) -> None:  # fmt: skip
+def _reduce(rows: RowArrays, nodes: NodeArrays, out: Array) -> None:
     """Blocks on and above the diagonal, in parts: shape (parts, nodes, nodes, 6, 6)."""
+    first, knot, weights, jacobian = rows.first, rows.knot, rows.weights, rows.jacobian
+    plane, weight, inverse = rows.plane, rows.weight, rows.inverse
+    every, mats, position, centre = nodes.every, nodes.mats, nodes.position_m, nodes.centre_m
     voxels = len(first) - 1
-    parts, nodes = out.shape[0], out.shape[1]
+    parts, count_nodes = out.shape[0], out.shape[1]
     for part in prange(parts):
         mine = out[part]
-        slot, touched = np.full(nodes, -1), np.empty(nodes, np.int64)
-        sums, solved, by = np.empty((nodes, 3, 6)), np.empty((3, 6)), np.empty((3, 6))
+        at = NodeArrays(every, mats, position, centre)
+        slot, touched = np.full(count_nodes, -1), np.empty(count_nodes, np.int64)
+        sums, solved, by = np.empty((count_nodes, 3, 6)), np.empty((3, 6)), np.empty((3, 6))
         for v in range(voxels * part // parts, voxels * (part + 1) // parts):
             count = 0
             for i in range(first[v], first[v + 1]):
                 if weight[i] == 0.0:
                     continue
                 node = knot[i] // every
-                last = _by_nodes(knot[i], node, weights[i], jacobian[i], every, mats, position, centre, by)
+                last = _by_nodes(knot[i], node, weights[i], jacobian[i], at, by)
                 for a in range(last + 1):
                     if slot[node + a] < 0:
                         slot[node + a], touched[count] = count, node + a
                         sums[count] = 0.0
                         count += 1
-                    _add_row(weight[i], a, last, by, plane[i], sums[slot[node + a]], mine[node + a, node:])
-            _without_planes(count, touched, sums, inverse[v], solved, mine)
+                    _add_row(weight[i], by[a : last + 1], plane[i], sums[slot[node + a]], mine[node + a, node + a :])
+            _without_planes(touched[:count], sums, inverse[v], solved, mine)
             for a in range(count):
                 slot[touched[a]] = -1
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath=True)
-def _add_row(weight: float, a: int, last: int, by: Any, plane: Any, sums: Any, blocks: Any) -> None:
-    """A row's part by node `a` in the sums of its voxel, and in the blocks of that node and those after it."""
+def _add_row(weight: float, by: Array, plane: Singles, sums: Array, blocks: Array) -> None:
+    """A row's part by its first node, by[0], in the sums of its voxel, and in the blocks of that node and those after it."""
     for c in range(6):
-        y = weight * by[a, c]
+        y = weight * by[0, c]
         sums[0, c] += y
         sums[1, c] += y * plane[0]
         sums[2, c] += y * plane[1]
-        for b in range(a, last + 1):
+        for b in range(len(by)):
             for d in range(6):
                 blocks[b, c, d] += y * by[b, d]
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath=True)
-def _by_nodes(
-    knot: int, node: int, weights: Any, jacobian: Any, every: int, mats: Any, position: Any, centre: Any, by: Any
-) -> int:
+def _by_nodes(knot: int, node: int, weights: Singles, jacobian: Singles, nodes: NodeArrays, by: Array) -> int:
     """A row by the motions of the nodes from `node` on, shape (3, 6); the number of the last that counts."""
+    mats, position, centre = nodes.mats, nodes.position_m, nodes.centre_m
     by[:] = 0.0
     last = 1
     nx, ny, nz = jacobian[3], jacobian[4], jacobian[5]
@@ -221,7 +229,7 @@ def _by_nodes(
         tx = m[0, 0] * jacobian[0] + m[0, 1] * jacobian[1] + m[0, 2] * jacobian[2]
         ty = m[1, 0] * jacobian[0] + m[1, 1] * jacobian[1] + m[1, 2] * jacobian[2]
         tz = m[2, 0] * jacobian[0] + m[2, 1] * jacobian[1] + m[2, 2] * jacobian[2]
-        g = at / every - node
+        g = at / nodes.every - node
         here = min(int(g), len(centre) - 2 - node)
         for a in range(here, here + 2):
             share = weights[j] * (1.0 - abs(g - a))
@@ -240,16 +248,13 @@ def _by_nodes(
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath=True)
-def _without_planes(count: int, touched: Any, sums: Any, inverse: Any, solved: Any, out: Any) -> None:
+def _without_planes(touched: Ints, sums: Array, inverse: Array, solved: Array, out: Array) -> None:
     """Take what the best plane of a voxel takes up off the blocks of the nodes that it touches."""
-    q = inverse
-    for a in range(count):
+    for a in range(len(touched)):
         s = sums[a]
         for c in range(6):
-            solved[0, c] = q[0] * s[0, c] + q[1] * s[1, c] + q[2] * s[2, c]
-            solved[1, c] = q[1] * s[0, c] + q[3] * s[1, c] + q[4] * s[2, c]
-            solved[2, c] = q[2] * s[0, c] + q[4] * s[1, c] + q[5] * s[2, c]
-        for b in range(count):
+            solved[0, c], solved[1, c], solved[2, c] = solved_plane(inverse, s[0, c], s[1, c], s[2, c])
+        for b in range(len(touched)):
             if touched[b] >= touched[a]:
                 block, other = out[touched[a], touched[b]], sums[b]
                 for c in range(6):

@@ -19,28 +19,20 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
-from groundproc.estimation.adjustment.anchors import attitude_factor, fixes_name, position_factors
-from groundproc.estimation.adjustment.batch import (
-    COMPASS_PRIOR,
-    DEFLATION,
-    DRAWS,
-    Posterior,
-    Spread,
-    turned,
-    whole_covariance,
-)
-from groundproc.estimation.adjustment.control import Held, held_to
-from groundproc.estimation.adjustment.factors import Factor, H, RowBuilder, Unknowns, cross, eye, prior_factor, whitened
+from groundproc.estimation.adjustment.batch import DRAWS, add_world, corrected, held, linearised, told_by
 from groundproc.estimation.adjustment.noise import noise_of
-from groundproc.estimation.adjustment.outside import Outside, outside_factors
 from groundproc.estimation.adjustment.patches import Patches, coarse
-from groundproc.estimation.adjustment.planes import Rows, placed, rows_of
+from groundproc.estimation.adjustment.poses import pose_errors
+from groundproc.estimation.adjustment.posterior import Posterior, Spread
 from groundproc.estimation.adjustment.solve import problem
-from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.observations.lidar import DEFLATION
+from groundproc.estimation.observations.observation import Observation, State
+from groundproc.estimation.observations.planes import Rows, placed, rows_of
+from groundproc.estimation.observations.rows import Factor, H, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
-from groundproc.estimation.odometry.stated import Attitudes, Positions
-from groundproc.flight.control import ControlPoint
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.splines import basis
+from groundproc.trajectory.covariance import SIZE, Correlation
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -61,6 +53,8 @@ LEAST_TURN: Final = np.deg2rad(0.0005)
 LEAST_SHIFT_M: Final = 0.0003
 """Of a window's shape no more is claimed, per root second."""
 LEAST_TILT: Final = np.deg2rad(0.003)
+SMOOTH_DRAWS: Final = 5
+"""Knots over which correlations of what is drawn are averaged: ten seconds."""
 TILT_TAU_S: Final = 240.0
 """The tilt of a path against gravity is that of the accelerometers' biases as a window knows them."""
 
@@ -129,18 +123,9 @@ class Joining:
     patches : Patches
     stiffness : Stiffness
         Of all slices.
-    positions, attitudes
+    observations : list of Observation
     mat_sensor_ins : ndarray, shape (3, 3)
         Boresight as the windows found it.
-    compass : ndarray, shape (5,)
-    outside : sequence of Outside
-    outside_delay_s : float
-        Of these, as the windows found it.
-    control : sequence of ControlPoint
-    control_clusters : Clusters, optional
-        What may be of a surface there.
-    held : Held, optional
-        What of the control the map meets.
     log : list of dict
         What each step said.
     """
@@ -149,45 +134,36 @@ class Joining:
     begin: Path
     patches: Patches
     stiffness: Stiffness
-    positions: Sequence[Positions]
-    attitudes: Sequence[Attitudes]
+    observations: Sequence[Observation]
     mat_sensor_ins: Array
-    compass: Array
-    outside: Sequence[Outside] = ()
-    outside_delay_s: float = 0.0
-    control: Sequence[ControlPoint] = ()
-    control_clusters: Clusters | None = None
-    held: Held | None = None
     log: list[dict[str, float]] = field(default_factory=list)
 
     def run(self) -> "Joined":
         """All steps, and the posterior of the last."""
         for voxel_m, cut in ROUNDS:
             last = self.step(voxel_m, cut)
-        if self.control and self.control_clusters is not None:
-            last = self._hold(last)
+        last = self._hold(last)
         return self._joined(last.unknowns, last.spread(DRAWS))
 
     def _hold(self, last: Posterior) -> Posterior:
-        """Lay the flight, which is right in itself, on the control as a whole, and adjust it with that."""
-        assert self.control_clusters is not None
-        covariance = whole_covariance(last, self.path)
-        self.held = held_to(self.control, self.control_clusters, self.path, covariance, DEFLATION)
-        if self.held is None:
-            return last
-        self.path = self.path.turned(*self.held.datum.placing.as_turn())
-        for voxel_m, cut in ROUNDS[-2:]:
-            last = self.step(voxel_m, cut)
+        """Where some observation lays the flight, which is right in itself, as a whole elsewhere: adjust it with that."""
+        path = held(self.observations, self.state(), last)
+        if path is not None:
+            self.path = path
+            for voxel_m, cut in ROUNDS[-2:]:
+                last = self.step(voxel_m, cut)
         return last
 
+    def state(self) -> State:
+        """What the observations share."""
+        return State(self.path, self.patches.clusters, self.mat_sensor_ins)
+
     def unknowns(self) -> Unknowns:
-        """A slow path, the whole's turn and shift, the mean error of the fixes and the compass."""
+        """A slow path, the whole's turn and shift, and what the observations have left to find: the mean error of fixes, the compass."""
         unknowns = Unknowns(self.path.intervals)
-        unknowns.add("world.turn", np.deg2rad([5.0, 5.0, 20.0]))
-        unknowns.add("world.shift", np.full(3, 100.0))
-        for number in range(len(self.positions)):
-            unknowns.add(fixes_name(number), np.full(3, 100.0))
-        unknowns.add("compass", COMPASS_PRIOR)
+        add_world(unknowns)
+        for each in self.observations:
+            each.unknowns(unknowns)
         return unknowns
 
     def step(self, voxel_m: float, cut: bool) -> Posterior:
@@ -195,65 +171,58 @@ class Joining:
         unknowns = self.unknowns()
         seen = self.patches.of(shared(self.patches, self.path, voxel_m))
         rows = rows_of(seen.clusters, self.path, voxel_m, ROWS, cut)
-        factors = self.factors(unknowns)
+        stated, figures = linearised(self.observations, self.state(), unknowns)
+        own = [
+            *shape_factors(self.begin, self.path, self.stiffness, unknowns),
+            tilt_factor(self.begin, self.path, self.stiffness.tilt, unknowns),
+        ]
+        factors = [*own, *stated]
         linear = problem(rows, factors, unknowns, DEFLATION, self.path)
         x, steps = linear.solve(-linear.gradient, ENOUGH)
         self.log.append(
             {"voxel_m": voxel_m, "patches": len(seen), "rows": len(rows), "steps": steps} | _apart(rows, seen)
         )
-        self.log[-1] |= {f"{factor.name}_rms": factor.rms() for factor in factors}
+        self.log[-1] |= {f"{factor.name}_rms": factor.rms() for factor in own} | figures
         before = self.path
-        path = self.path.corrected(x[: unknowns.path_size].reshape(-1, 6))
-        self.path = path.turned(turned(x[unknowns.names["world.turn"]]), x[unknowns.names["world.shift"]])
-        self.compass = self.compass + x[unknowns.names["compass"]]
+        self.path = corrected(before, unknowns, x)
+        part = {name: x[place] for name, place in unknowns.names.items()}
+        for each in self.observations:
+            each.take(part, self.path)
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(self.path.position_m - before.position_m).sum(axis=1).mean()))
         return Posterior(linear, unknowns, lambda: noise_of(rows, seen.clusters, before, DEFLATION, factors, x))
-
-    def factors(self, unknowns: Unknowns) -> list[Factor]:
-        """Everything but the patches."""
-        found = [*shape_factors(self.begin, self.path, self.stiffness, unknowns)]
-        found.append(tilt_factor(self.begin, self.path, self.stiffness.tilt, unknowns))
-        for number, positions in enumerate(self.positions):
-            found += position_factors(positions, self.path, unknowns, number)
-        for attitudes in self.attitudes:
-            factor = attitude_factor(attitudes, self.path, unknowns, self.mat_sensor_ins, self.compass, None)
-            if factor is not None:
-                found.append(factor)
-        for outside in self.outside:
-            found += outside_factors(outside, self.path, unknowns, self.outside_delay_s, self.mat_sensor_ins, None)
-        if self.held is not None and self.control_clusters is not None:
-            control = self.held.factor(self.control_clusters, self.path, unknowns)
-            found += [] if control is None else [control]
-        found.append(prior_factor(unknowns, {"compass": self.compass}))
-        return found
 
     def _joined(self, unknowns: Unknowns, spread: Spread) -> "Joined":
         """The correction, and its sigmas."""
         knots = slice(None, None, STEPS)
         mats, place = frames.mat_from_quat(self.path.quat[knots]), self.path.position_m[knots]
         names = unknowns.names
-        heading = frames.attitude_of(mats @ self.mat_sensor_ins)[0]
+        heading, pitch, _ = frames.attitude_of(mats @ self.mat_sensor_ins)
 
         def poses(x: Array) -> Array:
-            """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+            """Errors of position, and turns about the levelled axes forward, right, up, shape (n, 6)."""
             rotation, moved = _at_knots(x[: unknowns.path_size], mats)
             whole = x[names["world.turn"]]
             turn = rotation + whole
             forward = turn[:, 0] * np.sin(heading) + turn[:, 1] * np.cos(heading)
             right = turn[:, 0] * np.cos(heading) - turn[:, 1] * np.sin(heading)
             position = moved + np.cross(whole, place) + x[names["world.shift"]]
-            return np.stack([position, np.stack([forward, right, turn[:, 2]], axis=1)])
+            return np.column_stack([position, forward, right, turn[:, 2]])
 
+        errors = pose_errors(spread, poses, pitch, smooth=1, smooth_draws=SMOOTH_DRAWS)
         at = np.arange(len(self.begin.quat)) / STEPS
         sigmas = [
             np.stack([np.interp(at, np.arange(len(mats)), axis) for axis in part.T], axis=1)
-            for part in np.sqrt(spread.variance(poses))
+            for part in (errors.sigma_position_m, errors.sigma_attitude_rad)
         ]
-        sigma_compass = np.sqrt(spread.variance(operator.itemgetter(names["compass"])))
-        told: list[dict[str, Any]] = []
-        if self.held is not None and self.control_clusters is not None:
-            told = self.held.report(self.control_clusters, self.path)
-        return Joined(self.begin, self.path, sigmas[0], sigmas[1], (self.compass, sigma_compass), self.log, told)
+        correlation = Correlation(np.arange(len(mats)) * STEPS, errors.correlation).at(np.arange(len(self.begin.quat)))
+        values = self.unknowns().value
+        found = {
+            name: (values[name], np.sqrt(spread.variance(operator.itemgetter(where))))
+            for name, where in names.items()
+            if not name.startswith("world.")
+        }
+        told = told_by(self.observations, self.state())
+        return Joined(self.begin, self.path, sigmas[0], sigmas[1], found, self.log, told, correlation)
 
 
 @dataclass(slots=True)
@@ -266,20 +235,23 @@ class Joined:
         Coarse, before and after.
     sigma_position_m, sigma_attitude_rad : ndarray, shape (slices + 1 or more, 3)
         At slice boundaries: east, north, up; roll, pitch, heading. What a window does not know of itself comes on top.
-    compass : tuple of ndarray
-        The curve and its sigma [rad].
+    values : dict of str to (ndarray, ndarray)
+        Globals that the joining found, and their sigmas: the compass's curve.
     log : list of dict
-    control : list of dict
-        What is to be said of each control point; empty where none was met.
+    told : dict of str to Any
+        What the observations say, by their names.
+    correlation : ndarray, shape (slices + 1 or more, 6, 6)
+        Of the errors of position and attitude at slice boundaries.
     """
 
     begin: Path
     path: Path
     sigma_position_m: Array
     sigma_attitude_rad: Array
-    compass: tuple[Array, Array]
+    values: dict[str, tuple[Array, Array]]
     log: list[dict[str, float]]
-    control: list[dict[str, Any]] = field(default_factory=list)
+    told: dict[str, Any] = field(default_factory=dict)
+    correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
 
     def applied(self, path: Path) -> Path:
         """The path that was begun with, on its fine grid, as corrected."""
@@ -298,16 +270,15 @@ class Joined:
 
 
 def joining(
-    path: Path, patches: Patches, stiffness: Stiffness, positions: Sequence[Positions], attitudes: Sequence[Attitudes],
-    mat_sensor_ins: Array, compass: Array, outside: Sequence[Outside] = (), outside_delay_s: float = 0.0,
-    control: Sequence[ControlPoint] = (), control_clusters: Clusters | None = None,
-) -> Joining:  # fmt: skip
-    """Set the last adjustment up on the windows' joined path."""
+    path: Path,
+    patches: Patches,
+    stiffness: Stiffness,
+    observations: Sequence[Observation],
+    mat_sensor_ins: Array,
+) -> Joining:
+    """Set the last adjustment up on the windows' joined path; the observations are those that `joined` gave."""
     begin = padded(coarse(path))
-    return Joining(
-        begin, begin, patches, stiffness, positions, attitudes, mat_sensor_ins, compass, outside, outside_delay_s, control,
-        control_clusters,
-    )  # fmt: skip
+    return Joining(begin, begin, patches, stiffness, observations, mat_sensor_ins)
 
 
 def padded(path: Path) -> Path:

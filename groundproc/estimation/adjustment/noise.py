@@ -15,21 +15,18 @@ import numpy.typing as npt
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.estimation.adjustment.factors import Factor
-from groundproc.estimation.adjustment.planes import Rows
+from groundproc.estimation.observations.planes import Rows
+from groundproc.estimation.observations.rows import PRIOR, Errors, Factor
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.spline import Path, basis
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 LASTING_ROWS: Final = 20
 """Rows on end (of a tenth of a second each) whose errors are taken to go together: what lasts longer is found as a bias or a scale."""
-
-
-ANCHORS: Final = ("position", "attitude", "outside")
-"""Factors that say where the whole lies begin with these words."""
 PATCH_M: Final = 4.0
 """Edge of the cubes within which what a surface is not goes together: with larger ones the spread of simulated flights grows no more."""
 
@@ -148,46 +145,26 @@ class Carrier:
         return found
 
 
-@dataclass(slots=True)
-class Carrying:
-    """The gyro that carries the motion between knots.
-
-    Attributes
-    ----------
-    name : str
-        Of its factor.
-    known : ndarray of bool, shape (intervals,)
-        Intervals that the factor has rows for.
-    walk_rad : float
-        Noise of its turn over a grid step.
-    """
-
-    name: str
-    known: npt.NDArray[np.bool_]
-    walk_rad: float
-
-
 def noise_of(
-    rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array,
-    by: Carrying | None = None,
-) -> Noise:  # fmt: skip
+    rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array
+) -> Noise:
     """The sources of errors about a solution `x` of a problem that is linear about `path`; where no gyro carries it, none between knots."""
     step = np.clip((clusters.time_ns[rows.cluster] - path.start_ns) // path.step_ns, 0, len(path.quat) - 2)
     mats = frames.mat_from_quat(path.quat)
     voxel = np.repeat(np.arange(len(rows.first) - 1), np.diff(rows.first))
     inside = step[rows.first[:-1]]
     place = np.einsum("nij,nj->ni", mats[inside], clusters.xyz_m[rows.cluster[rows.first[:-1]]])
-    carrier, others, anchors = None, [], []
+    carrier, walk_rad, others, anchors = None, 0.0, [], []
     for factor in factors:
         whitened = sparse.diags(1.0 / factor.sigma) @ factor.matrix
-        if by is not None and factor.name == by.name:
-            interval = np.flatnonzero(by.known)
+        if factor.carrying is not None:
+            interval, walk_rad = factor.carrying.interval, factor.carrying.walk_rad
             carrier = Carrier(factor, interval, mats[(interval + 1) * STEPS])
-        elif factor.name.endswith(("gyro", "accelerometer")):
+        elif factor.errors is Errors.LASTING:
             others.append(whitened * lasting(factor.residual / factor.sigma + whitened @ x))
-        elif factor.name == "prior":  # that of the path is no knowledge, only a weak hold
+        elif factor.name == PRIOR:  # that of the path is no knowledge, only a weak hold
             anchors.append(whitened[6 * (rows.intervals + 3) :])
-        elif factor.name.startswith(ANCHORS):
+        elif factor.errors is Errors.ANCHOR:
             anchors.append(whitened)
         else:
             others.append(whitened)
@@ -195,7 +172,7 @@ def noise_of(
     return Noise(
         rows, deflation, rows.residual_m + rows.along(x[: rows.size]), _patches(place + path.position_m[inside])[voxel], step,
         np.einsum("nij,ni->nj", np.swapaxes(mats, 1, 2)[step], rows.jacobian[:, :3]), followed(path),
-        0.0 if by is None else by.walk_rad, carrier,
+        walk_rad, carrier,
         sparse.vstack([none, *others], format="csr"), sparse.vstack([none, *anchors], format="csr"),
     )  # fmt: skip
 

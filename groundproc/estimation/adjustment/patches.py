@@ -3,21 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.estimation.adjustment.planes import assign, placed, sorted_by
+from groundproc.estimation.observations.planes import placed
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import even_shares
-from groundproc.numerics.rotations import flattest
-from groundproc.numerics.voxelhash import spread, voxel_key
+from groundproc.numerics.planes import Placed, add_scatter, flattest_of
+from groundproc.numerics.voxelhash import assign, sorted_by, spread, voxel_key
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 PATCH_M: Final = 1.0
 """Edge of the voxels that patches are of."""
@@ -109,37 +110,61 @@ def patches_of(gathered: Clusters, path: Path, window: int) -> Patches:
     return Patches(clusters, draw.astype(np.float32), np.full(len(draw), window, np.int32))
 
 
+class _Merged(NamedTuple):
+    """What the clusters of each voxel make together.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int64, shape (voxels,)
+        Mean time.
+    mean_m : ndarray, shape (voxels, 3)
+    scatter_m2 : ndarray, shape (voxels, 6)
+    returns : ndarray, shape (voxels,)
+    kind : ndarray of int64, shape (voxels,)
+        0 for ground, 1 for other planes, -1 for what is none.
+    draw : ndarray, shape (voxels,)
+        In [0, 1), by the place.
+    """
+
+    time_ns: Ints
+    mean_m: Array
+    scatter_m2: Array
+    returns: Array
+    kind: Ints
+    draw: Array
+
+
 def _merged(gathered: Clusters, world: Array, chunk: slice) -> tuple[npt.NDArray[Any], ...]:
     """Time, place, scatter, returns and draw of the patches of a chunk."""
     place = world[chunk]
     voxel, voxels = assign(place, PATCH_M)
     order, first = sorted_by(voxel, voxels)
-    time_ns, mean, scatter = np.empty(voxels, np.int64), np.empty((voxels, 3)), np.empty((voxels, 6))
-    count, kind, draw = np.empty(voxels), np.empty(voxels, np.int64), np.empty(voxels)
-    _merge(
-        first, order, gathered.time_ns[chunk], place, gathered.scatter_m2[chunk], gathered.count[chunk], time_ns, mean, scatter,
-        count, kind, draw,
+    out = _Merged(
+        np.empty(voxels, np.int64), np.empty((voxels, 3)), np.empty((voxels, 6)), np.empty(voxels), np.empty(voxels, np.int64),
+        np.empty(voxels),
     )  # fmt: skip
-    shares = np.append(even_shares(np.bincount(kind[kind >= 0], minlength=2), KEPT), 0.0)
-    kept = draw < shares[kind]
-    return time_ns[kept], mean[kept], scatter[kept], count[kept], draw[kept]
+    # the chunk is some seconds long: its clusters need no knots and no groups
+    none = np.empty(0, np.int32)
+    seen = Placed(place, gathered.scatter_m2[chunk], gathered.count[chunk], none, none)
+    _merge(first, order, gathered.time_ns[chunk], seen, out)
+    shares = np.append(even_shares(np.bincount(out.kind[out.kind >= 0], minlength=2), KEPT), 0.0)
+    kept = out.draw < shares[out.kind]
+    return out.time_ns[kept], out.mean_m[kept], out.scatter_m2[kept], out.returns[kept], out.draw[kept]
 
 
 @njit(cache=True, nogil=True)
-def _merge(
-    first: Any, order: Any, time_ns: Any, world: Any, scatter: Any, counts: Any, out_time: Any, mean: Any, out_scatter: Any,
-    count: Any, kind: Any, draw: Any,
-) -> None:  # fmt: skip
-    """Sums of each voxel; `kind` is 0 for ground, 1 for other planes, -1 for what is none."""
+def _merge(first: Ints, order: Ints, time_ns: Ints, seen: Placed, out: _Merged) -> None:
+    """Sum up each voxel."""
+    world, scatter, returns = seen.world_m, seen.scatter_m2, seen.returns
     normal = np.empty(3)
     for v in range(len(first) - 1):
         total, since = 0.0, 0.0
         begin_ns = time_ns[order[first[v]]]
-        m, s = mean[v], out_scatter[v]
+        m, s = out.mean_m[v], out.scatter_m2[v]
         m[:], s[:] = 0.0, 0.0
         for at in range(first[v], first[v + 1]):
             n = order[at]
-            w = np.float64(counts[n])
+            w = np.float64(returns[n])
             total += w
             since += w * (time_ns[n] - begin_ns)
             for c in range(3):
@@ -147,19 +172,12 @@ def _merge(
         m /= total
         for at in range(first[v], first[v + 1]):
             n = order[at]
-            w = np.float64(counts[n])
-            x, y, z = world[n, 0] - m[0], world[n, 1] - m[1], world[n, 2] - m[2]
-            s[0] += scatter[n, 0] + w * x * x
-            s[1] += scatter[n, 1] + w * x * y
-            s[2] += scatter[n, 2] + w * x * z
-            s[3] += scatter[n, 3] + w * y * y
-            s[4] += scatter[n, 4] + w * y * z
-            s[5] += scatter[n, 5] + w * z * z
-        out_time[v], count[v] = begin_ns + np.int64(since / total), total
-        draw[v] = (spread(voxel_key(m[0], m[1], m[2], 1.0 / PATCH_M) * 7919) & 0xFFFFF) / 1048576.0
-        kind[v] = -1
+            w = np.float64(returns[n])
+            add_scatter(s, 1.0, scatter[n], w, (world[n, 0] - m[0], world[n, 1] - m[1], world[n, 2] - m[2]))
+        out.time_ns[v], out.returns[v] = begin_ns + np.int64(since / total), total
+        out.draw[v] = (spread(voxel_key(m[0], m[1], m[2], 1.0 / PATCH_M) * 7919) & 0xFFFFF) / 1048576.0
+        out.kind[v] = -1
         if total >= FEWEST:
-            part = 1.0 / total
-            low, middle = flattest(s[0] * part, s[1] * part, s[2] * part, s[3] * part, s[4] * part, s[5] * part, normal)
+            low, middle = flattest_of(s, 1.0 / total, normal)
             if low < THICKEST_M**2 and middle > (NARROWEST * PATCH_M) ** 2 and low < 0.15 * middle:
-                kind[v] = 0 if abs(normal[2]) > 0.9 else 1
+                out.kind[v] = 0 if abs(normal[2]) > 0.9 else 1

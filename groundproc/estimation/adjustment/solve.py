@@ -10,8 +10,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from groundproc.estimation.adjustment.coarse import Coarse, coarse_of
-from groundproc.estimation.adjustment.factors import Factor, Unknowns, normal_equations
-from groundproc.estimation.adjustment.planes import Rows
+from groundproc.estimation.observations.planes import Rows
+from groundproc.estimation.observations.rows import Factor, Unknowns, normal_equations
 from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]

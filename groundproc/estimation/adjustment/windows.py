@@ -10,24 +10,23 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter1d
 
 from flightlog import frames
-from groundproc.estimation.adjustment import lasers
-from groundproc.estimation.adjustment.anchors import Tie
-from groundproc.estimation.adjustment.batch import DRAWS, Batch, Posterior, Spread, joined, make_unit
-from groundproc.estimation.adjustment.control import kept_for, together
-from groundproc.estimation.adjustment.factors import H, Unknowns
+from groundproc.estimation.adjustment.batch import DRAWS, Batch
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
-from groundproc.estimation.adjustment.outside import DELAY, Outside
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
-from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
+from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
+from groundproc.estimation.observations import lasers
+from groundproc.estimation.observations.lidar import Lidar
+from groundproc.estimation.observations.observation import Observation, Stretch
+from groundproc.estimation.observations.rows import H, Unknowns
+from groundproc.estimation.observations.tie import Tie
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
-from groundproc.estimation.odometry.motion import ImuTrack, Motion
+from groundproc.estimation.odometry.motion import Motion
 from groundproc.estimation.odometry.spline import Path
-from groundproc.estimation.odometry.stated import Attitudes, Positions
 from groundproc.estimation.odometry.track import Track
-from groundproc.flight.control import ControlPoint
+from groundproc.trajectory.covariance import SIZE
 
 Array = npt.NDArray[np.float64]
 
@@ -41,6 +40,10 @@ LEVER_FLOOR_M: Final = 0.003
 """The same for the lever arm, which is found through accelerometers whose axes are no better."""
 UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
 """What the residuals do not show, by the global that it is in."""
+SMOOTH: Final = 11
+SMOOTH_DRAWS: Final = 101
+"""Slices over which variances of poses are averaged, and correlations of what is drawn: ten seconds hold several times the errors that
+one knot has, and a leg of the flight is longer."""
 CALIBRATION: Final = ("ins.turn", "ins.lever", "ins.scale", "ins.delay", "ins.drift")
 """What other flights go by: their covariance is not drawn, but solved for column by column."""
 
@@ -51,30 +54,29 @@ class Sources:
 
     Attributes
     ----------
-    units : mapping of str to ImuTrack
-        "lidar", "ins" or both.
-    positions, attitudes
+    observations : sequence of Observation
+        Not begun.
     mat_ins_lidar, lever_m : ndarray
         Nominal mount.
     exact : tuple of str
         Globals whose covariance is wanted exactly.
-    outside : sequence of Outside
-        Positions and poses of another program.
     lasers_apart : bool
         Whether clusters are of one laser each, and the corrections of lasers unknowns.
-    control : tuple of ControlPoint
-        In the local frame.
     """
 
-    units: Mapping[str, ImuTrack]
-    positions: Sequence[Positions]
-    attitudes: Sequence[Attitudes]
+    observations: Sequence[Observation]
     mat_ins_lidar: Array
     lever_m: Array
     exact: tuple[str, ...] = ()
-    outside: Sequence[Outside] = ()
     lasers_apart: bool = False
-    control: tuple[ControlPoint, ...] = ()
+
+    def leads(self) -> bool:
+        """Whether something is better, where the lidar sees nothing, than what the adjustment began from."""
+        return any(each.leads for each in self.observations)
+
+
+TIED: Final = 1e-6
+"""Share of the prior of the whole's turn and shift that is left to a window that is tied to another."""
 
 
 @dataclass(slots=True)
@@ -90,6 +92,8 @@ class Window:
     path : Path
     values : dict of str to (ndarray, ndarray)
         Globals and their sigmas.
+    unknowns : Unknowns
+        What was known of the globals before, and their units.
     sigma_position_m, sigma_attitude_rad : ndarray, shape (slices + 1, 3)
         At slice boundaries: east, north, up; roll, pitch, heading; of the ins frame.
     log : list of dict
@@ -98,11 +102,13 @@ class Window:
         Of the globals asked for exactly, without what a gyro's axes may differ from its board's.
     corrections : tuple of (ndarray, ndarray), optional
         Of the lasers, shape (64,), and their covariance.
-    control : list of dict
-        What is to be said of each control point; empty where none was met.
+    told : dict of str to Any
+        What the observations say, by their names.
     seen : Seen or None
         What the joining needs of it; a window that is the whole flight is not joined, and its sigmas are those of the whole. Those of
         the others are what they do not know of themselves.
+    correlation : ndarray, shape (slices + 1, 6, 6)
+        Of the errors of position and attitude.
     """
 
     first: int
@@ -110,13 +116,15 @@ class Window:
     own: int
     path: Path
     values: dict[str, tuple[Array, Array]]
+    unknowns: Unknowns
     sigma_position_m: Array
     sigma_attitude_rad: Array
     log: list[dict[str, float]]
     covariance: Array | None = None
     corrections: tuple[Array, Array] | None = None
-    control: list[dict[str, Any]] = field(default_factory=list)
+    told: dict[str, Any] = field(default_factory=dict)
     seen: "Seen | None" = None
+    correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
 
 
 @dataclass(slots=True)
@@ -127,13 +135,13 @@ class Seen:
     ----------
     patches : Patches
     stiffness : Stiffness
-    control : Clusters, optional
-        What may be of a surface at some control, in the frame of the coarse path.
+    kept : dict of str to Any
+        What the observations need of it, by their names.
     """
 
     patches: Patches
     stiffness: Stiffness
-    control: Clusters | None = None
+    kept: dict[str, Any] = field(default_factory=dict)
 
 
 def adjust_window(
@@ -152,51 +160,31 @@ def adjust_window(
         tie = Tie(previous.path.quat[common], previous.path.position_m[common])
         path = _laid_on(path, tie)
     mat, lever = sources.mat_ins_lidar, sources.lever_m
-    to_ins = -mat.T @ lever
     bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
-    units = [
-        make_unit(
-            name,
-            unit,
-            path,
-            bias if unit.name == motion.source else np.zeros(3),
-            np.zeros(3) if name == "lidar" else to_ins,
-        )
-        for name, unit in sources.units.items()
-    ]
-    gathered = track.gathered(first, last, sources.lasers_apart)
+    stretch = Stretch(path, motion.source, bias, whole=not before and not more)
+    observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
+    lidar = Lidar(track.gathered(first, last, sources.lasers_apart))
     track.forget(last - OVERLAP if more else last)
-    batch = Batch(
-        path,
-        gathered,
-        units,
-        dict(sources.units),
-        sources.positions,
-        sources.attitudes,
-        mat.T,
-        to_ins,
-        tie=tie,
-        outside=sources.outside,
-        told=told,
-        control=() if before or more else sources.control,
-    )
+    batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
     spread = posterior.spread(DRAWS)
-    (values, exact), seen = _values(batch, posterior, spread, sources.exact), None
+    unknowns = batch.unknowns()
+    (values, exact), seen = _values(unknowns, posterior, spread, sources.exact), None
     if before or more:
         stiffness = stiffness_of(batch.path, posterior.unknowns, spread.whole)
-        control = kept_for(sources.control, gathered, batch.path, coarse(batch.path)) if sources.control else None
-        seen = Seen(patches_of(gathered, batch.path, len(before)), stiffness, control)
+        frame = coarse(batch.path)
+        kept = {each.name: each.keep(batch.state(), frame) for each in observations}
+        seen = Seen(patches_of(lidar.clusters, batch.path, len(before)), stiffness, kept)
         # how the whole lies is asked for when all windows are joined
         spread = spread.without([posterior.unknowns.names[name] for name in ("world.turn", "world.shift")])
-    position, attitude = _sigmas(batch.path, posterior.unknowns, spread, mat, lever, motion.rate_density)
+    errors = _errors(batch.path, posterior.unknowns, spread, mat, lever, motion.rate_density)
     corrections = None
     if sources.lasers_apart:
-        corrections = batch.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
-    held = [] if batch.held is None else batch.held.report(batch.clusters, batch.path)
+        corrections = lidar.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
     return Window(
-        first, last, last - first, batch.path, values, position, attitude, batch.log, exact, corrections, held, seen
-    )
+        first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
+        batch.log, exact, corrections, batch.said(), seen, errors.correlation,
+    )  # fmt: skip
 
 
 def corrections_over(windows: Sequence[Window]) -> tuple[Array, Array] | None:
@@ -215,17 +203,14 @@ def _laid_on(path: Path, tie: Tie) -> Path:
 
 
 def _values(
-    batch: Batch, posterior: Posterior, spread: Spread, exact: tuple[str, ...]
+    unknowns: Unknowns, posterior: Posterior, spread: Spread, exact: tuple[str, ...]
 ) -> tuple[dict[str, tuple[Array, Array]], Array | None]:
-    """Globals with their sigmas, and the covariance of those asked for."""
-    found, common = {}, {"compass": batch.compass, DELAY: batch.outside_delay_s}
+    """Globals with their sigmas, and the covariance of those asked for; `unknowns` are those after the last step."""
+    found = {}
     names = posterior.unknowns.names
     for name, where in names.items():
-        unit, _, key = name.partition(".")
-        if unit in ("world", "lasers"):
-            continue
-        value = common[name] if name in common else next(u for u in batch.units if u.name == unit).values[key]
-        found[name] = (value, np.sqrt(spread.variance(operator.itemgetter(where))))
+        if name.partition(".")[0] not in ("world", "lasers"):
+            found[name] = (unknowns.value[name], np.sqrt(spread.variance(operator.itemgetter(where))))
     wanted = [name for name in dict.fromkeys((*exact, *CALIBRATION)) if name in names]
     covariance = posterior.covariance(wanted)
     at = 0
@@ -237,19 +222,19 @@ def _values(
     return found, covariance[:asked, :asked] if exact and set(exact) <= set(found) else None
 
 
-def _sigmas(
+def _errors(
     path: Path, unknowns: Unknowns, spread: Spread, mat_ins_lidar: Array, lever: Array, rate_density: float
-) -> tuple[Array, Array]:
-    """Sigmas of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
+) -> PoseErrors:
+    """Errors of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
     quat, place = path.quat[::STEPS], path.position_m[::STEPS]
     mats = frames.mat_from_quat(quat)
     to_ins = -mat_ins_lidar.T @ lever
-    heading = frames.attitude_of(mats @ mat_ins_lidar.T)[0]
+    heading, pitch, _ = frames.attitude_of(mats @ mat_ins_lidar.T)
     right = np.stack([np.cos(heading), -np.sin(heading)], axis=1)
     ahead = np.stack([np.sin(heading), np.cos(heading)], axis=1)
 
     def poses(x: Array) -> Array:
-        """Errors of position and of roll, pitch, heading, shape (2, n, 3)."""
+        """Errors of position, and turns about the levelled axes forward, right, up, shape (n, 6)."""
         part = {name: x[where] for name, where in unknowns.names.items()}
         spline = x[: unknowns.path_size].reshape(-1, 6)
         at = (spline[:-2] + 4.0 * spline[1:-1] + spline[2:]) / 6.0
@@ -258,19 +243,13 @@ def _sigmas(
         arm = np.cross(at[:, :3], to_ins) + part.get("ins.lever", np.zeros(3))
         moved = at[:, 3:] + np.cross(part["world.turn"], place) + part["world.shift"]
         position = moved + np.einsum("nij,nj->ni", mats, arm)
-        return np.stack(
-            [
-                position,
-                np.stack([(turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1), turn[:, 2]], axis=1),
-            ]
-        )
+        forward, sideways = (turn[:, :2] * ahead).sum(axis=1), (turn[:, :2] * right).sum(axis=1)
+        return np.column_stack([position, forward, sideways, turn[:, 2]])
 
-    position, attitude = uniform_filter1d(spread.variance(poses), 11, axis=1, mode="nearest")
-    if "ins.turn" in unknowns.names:
-        attitude = attitude + MISALIGNMENT_RAD**2
     # what the gyro adds between two knots, the mean of a Brownian bridge
     bridge = rate_density**2 * H / 6.0
-    return np.sqrt(position), np.sqrt(attitude + bridge)
+    extra = bridge + (MISALIGNMENT_RAD**2 if "ins.turn" in unknowns.names else 0.0)
+    return pose_errors(spread, poses, pitch, smooth=SMOOTH, smooth_draws=SMOOTH_DRAWS, extra=extra)
 
 
 def joined_path(windows: Sequence[Window]) -> Path:
@@ -304,10 +283,17 @@ def all_patches(windows: Sequence[Window]) -> Patches:
     return all_of(parts)
 
 
-def control_clusters(windows: Sequence[Window]) -> Clusters | None:
-    """What all windows kept for control; None where nothing was."""
-    parts = [window.seen.control for window in windows if window.seen is not None and window.seen.control is not None]
-    return together(parts) if parts else None
+def observations_joined(
+    windows: Sequence[Window], observations: Sequence[Observation], values: Mapping[str, Array]
+) -> list[Observation]:
+    """What the joining goes by, with globals as the windows found them and what these kept for it."""
+    found = []
+    for each in observations:
+        kept = [window.seen.kept.get(each.name) for window in windows if window.seen is not None]
+        joint = each.joined(values, kept)
+        if joint is not None:
+            found.append(joint)
+    return found
 
 
 def whole_stiffness(windows: Sequence[Window]) -> Stiffness:

@@ -17,6 +17,7 @@ from flightlog import config
 from flightlog.config import option
 from flightlog.errors import LogError
 from groundproc.files import written_aside
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 
@@ -116,7 +117,7 @@ def fit_compass(runs: Sequence[Run], harmonics: int = 2) -> CompassCurve:
         residual = observed - design @ coefficients
         freedom = max(weight.sum() - min(size, len(observed) - 1), 1.0)
         scatter = max(float(np.sqrt((weight * residual**2).sum() / freedom)), LEAST_SCATTER_DEG)
-        weight = np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(residual), 1e-12))
+        weight = robust.huber(np.abs(residual), HUBER * scatter)
     covariance = np.linalg.inv(design.T @ (weight[:, None] * design) / scatter**2 + prior)
     seen = len(np.unique(sector_of(heading))) / BINS
     rows = tuple(tuple(row) for row in covariance.tolist())

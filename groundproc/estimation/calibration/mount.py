@@ -15,11 +15,14 @@ from scipy.stats import chi2
 
 from flightlog import frames
 from flightlog.mount import Mount
-from groundproc.estimation.adjustment import lasers
-from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, PRIORS, joined, turned
-from groundproc.estimation.adjustment.lasers import Corrections
+from groundproc.estimation.adjustment.posterior import joined
 from groundproc.estimation.adjustment.windows import UNSEEN, Window, corrections_over
 from groundproc.estimation.calibration.compass import BINS, CompassCurve, curve_of_errors, sector_of
+from groundproc.estimation.observations import lasers
+from groundproc.estimation.observations.attitudes import COMPASS_PRIOR, compass_terms
+from groundproc.estimation.observations.inertial import PRIORS
+from groundproc.estimation.observations.lasers import Corrections
+from groundproc.estimation.observations.rows import turned
 from groundproc.estimation.odometry.grid import STEPS
 
 Array = npt.NDArray[np.float64]
@@ -228,7 +231,7 @@ def headings_of(windows: Sequence[Window], nominal: Mount, curve: Array) -> npt.
     """Sectors of the heading as the autopilot stated it that were flown, shape (BINS,)."""
     quat = np.concatenate([window.path.quat[: window.own * STEPS : STEPS] for window in windows])
     true = frames.attitude_of(frames.mat_from_quat(quat) @ nominal.mat_ins_lidar().T)[0]
-    terms = np.stack([np.ones_like(true), np.sin(true), np.cos(true), np.sin(2 * true), np.cos(2 * true)], axis=1)
+    terms = compass_terms(true)
     return np.bincount(sector_of(true + terms @ curve), minlength=BINS) >= FEWEST
 
 
@@ -259,7 +262,7 @@ def calibrate(flights: Sequence[FlightResult]) -> MountCalibration:
 def _scatter_deg(flights: Sequence[FlightResult], curve: Array) -> float:
     """How far the flights' own compass curves lie from the common one, RMS over the headings that each has flown."""
     middle = (np.arange(BINS) + 0.5) * 2.0 * np.pi / BINS
-    terms = np.stack([np.ones(BINS), np.sin(middle), np.cos(middle), np.sin(2 * middle), np.cos(2 * middle)], axis=1)
+    terms = compass_terms(middle)
     off = [(terms @ (f.compass_rad - curve))[f.headings] for f in flights]
     squares = np.concatenate([np.zeros(0), *off]) ** 2
     return float(np.rad2deg(np.sqrt(squares.mean()))) if len(squares) and len(flights) > 1 else 0.0

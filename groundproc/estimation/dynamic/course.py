@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from groundproc.estimation.ins import PositionFixes
 from groundproc.geodesy import LocalFrame
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -93,5 +94,5 @@ def compare(trim_rad: Array, course_trim_rad: Array) -> dict[str, Any]:
         "share": float(known.mean()),
         "trim_minus_course_median_deg": float(np.median(apart_deg)),
         "trim_minus_course_rms_deg": float(np.sqrt(np.square(apart_deg).mean())),
-        "scatter_deg": float(1.4826 * np.median(np.abs(apart_deg - np.median(apart_deg)))),
+        "scatter_deg": robust.sigma(apart_deg),
     }

@@ -5,7 +5,6 @@ trajectory, with which the cloud is then made.
 """
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,18 +14,20 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.errors import CoverageError
+from groundproc.estimation import methods
 from groundproc.estimation.calibration.compass import CompassCurve, Run, read_compass
 from groundproc.estimation.dynamic import course as courses
 from groundproc.estimation.dynamic.revolutions import revolutions
 from groundproc.estimation.dynamic.search import VARIABLES, YAW, Found, Search
-from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw, write_trims
-from groundproc.estimation.method import Estimate, Given, Progress
-from groundproc.sensors.hdl32e import Gate
+from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
+from groundproc.estimation.method import Given, Method, Progress
+from groundproc.numerics import robust
+from groundproc.sensors.shots import Gate
+from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
-Method = Callable[[Given, Progress], Estimate]
 
 SETTLED_S: Final = 5.0
 """Yaw trims of the first seconds are not of the compass yet: the source's settle in 2 to 5 s [s]."""
@@ -38,15 +39,8 @@ WORSE: Final = 1.02
 """Trims that make the revolutions fit each other worse than this ratio are not applied; where there is nothing to see it is 1 and noise."""
 
 
-def dynamic_estimate(given: Given, progress: Progress, start: Method) -> Estimate:
-    """The trajectory of another method, trimmed.
-
-    Parameters
-    ----------
-    given : Given
-    progress : Progress
-    start : callable
-        The method whose trajectory is trimmed.
+def dynamic_estimate(given: Given, progress: Progress) -> Estimate:
+    """The trajectory of another method, which the survey names, trimmed.
 
     Raises
     ------
@@ -54,7 +48,7 @@ def dynamic_estimate(given: Given, progress: Progress, start: Method) -> Estimat
         Not one revolution of the lidar has a pose.
     """
     options = given.survey.dynamic
-    begun = start(given, progress)
+    begun = methods.find(options.start).estimate(given, progress)
     curve = None if given.survey.compass is None else read_compass(Path(given.survey.compass))
     trajectory = begun.trajectory if curve is None else with_compass(begun.trajectory, curve)
     course = courses.course_of(given.fixes, [leg.utc_from_boot for leg in given.placed], given.frame)
@@ -86,7 +80,7 @@ def dynamic_estimate(given: Given, progress: Progress, start: Method) -> Estimat
         trajectory=applied(trajectory, values),
         sigma_source=f"those of method {options.start}, less the trims: {begun.sigma_source}",
         report=report,
-        products=(functools.partial(_write, trims),),
+        figures=trims.figures(),
     )
 
 
@@ -141,9 +135,7 @@ def _report(trims: Trims, ratio: float, curve: CompassCurve | None) -> dict[str,
             name: {"median": float(np.median(v)), "least": float(v.min()), "largest": float(v.max())}
             for name, v in _named(trims.values).items()
         },
-        "yaw_scatter_deg": float(1.4826 * np.median(np.abs(np.diff(yaw_deg[::10])))) / np.sqrt(2)
-        if len(yaw_deg) > 20
-        else None,
+        "yaw_scatter_deg": robust.sigma(np.diff(yaw_deg[::10]), 0.0) / np.sqrt(2) if len(yaw_deg) > 20 else None,
         "course": courses.compare(trims.values[:, YAW], trims.course_rad),
         "compass": None if curve is None else {"runs": curve.runs, "scatter_deg": curve.scatter_deg},
     }
@@ -163,8 +155,4 @@ def _before_after(pairs: Array) -> dict[str, float] | None:
     return {"before": float(known[:, 0].mean()), "after": float(known[:, 1].mean())} if len(known) else None
 
 
-def _write(trims: Trims, folder: Path) -> None:
-    from groundproc.products.trim_plot import draw_trims
-
-    write_trims(folder / "trims.csv", trims)
-    draw_trims(folder / "trims.png", trims.time_ns, _named(trims.values), np.rad2deg(trims.course_rad))
+METHOD: Final = Method(dynamic_estimate, options=("compass", "dynamic"), uses_points=True)

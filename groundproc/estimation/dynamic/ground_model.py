@@ -8,18 +8,36 @@ A raster is dense, so that a pixel is one look, and is cleared pixel by pixel, s
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.estimation.dynamic.plan import DistanceMap
+from groundproc.estimation.dynamic.plan import DistanceMap, Trimmed, pixel_of
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 
 _NOTHING: Final = np.zeros((1, 1), np.float32)
+
+
+class RasterArrays(NamedTuple):
+    """A `Raster` as kernels take it; the fields stand there."""
+
+    pixel_m: float
+    height_m: Floats
+    weight: npt.NDArray[np.int32]
+    touched: npt.NDArray[np.int32]
+    used: npt.NDArray[np.int64]
+
+
+class _Near(NamedTuple):
+    """A `DistanceMap` as kernels take it; a limit of 0 where there is none."""
+
+    distance_m: Floats
+    pixel_m: float
+    limit_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +79,9 @@ class Raster:
         """From the middle to each side."""
         return 0.5 * self.pixel_m * len(self.height_m)
 
-    def arrays(self) -> tuple[Any, ...]:
-        """What the kernels want."""
-        return self.pixel_m, self.height_m, self.weight, self.touched, self.used
+    def arrays(self) -> RasterArrays:
+        """What the kernels take."""
+        return RasterArrays(self.pixel_m, self.height_m, self.weight, self.touched, self.used)
 
     def model(self) -> Array:
         """Heights with nan where there is none, shape (n, n)."""
@@ -85,7 +103,7 @@ def add(raster: Raster, turned_m: Floats, base_m: Floats, mat: Array, shift_m: A
     shift_m : ndarray, shape (3,)
         From the raster's middle to the INS at the revolution's middle, trims included.
     """
-    _add(turned_m, base_m, mat, shift_m, raster.arrays())
+    _add(Trimmed.of(turned_m, base_m, mat, shift_m), raster.arrays())
 
 
 def finish(raster: Raster, fill: int) -> None:
@@ -98,8 +116,10 @@ def clear(raster: Raster) -> None:
     _clear(raster.arrays())
 
 
-def _near(upright: DistanceMap | None) -> tuple[Floats, float, float]:
-    return (_NOTHING, 1.0, 0.0) if upright is None else (upright.distance_m, upright.pixel_m, upright.limit_m)
+def _near(upright: DistanceMap | None) -> _Near:
+    if upright is None:
+        return _Near(_NOTHING, 1.0, 0.0)
+    return _Near(upright.distance_m, upright.pixel_m, upright.limit_m)
 
 
 def compare(raster: Raster, reference: Raster, loss_m: float, upright: DistanceMap | None = None) -> tuple[float, int]:
@@ -130,33 +150,24 @@ def evaluate(
     upright: DistanceMap | None = None,
 ) -> tuple[float, int]:
     """The model of points under a trim, compared with a reference: `add`, `finish`, `compare`, `clear` in one call."""
-    total, count = _evaluate(
-        turned_m, base_m, mat, shift_m, raster.arrays(), reference.arrays(), fill, loss_m, _near(upright)
-    )
+    points = Trimmed.of(turned_m, base_m, mat, shift_m)
+    total, count = _evaluate(points, raster.arrays(), reference.arrays(), fill, loss_m, _near(upright))
     return float(total), int(count)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _add(turned: Any, base: Any, mat: Any, shift: Any, raster: Any) -> None:
+def _add(points: Trimmed, raster: RasterArrays) -> None:
     pixel, height, weight, touched, used = raster
+    turned, base, m, s = points.turned_m, points.base_m, points.mat, points.shift_m
     n = height.shape[0]
     scale = np.float32(1.0 / pixel)
-    half = np.float32(0.5 * n)
-    m = mat.astype(np.float32)
-    s = shift.astype(np.float32)
     flat_height, flat_weight = height.ravel(), weight.ravel()
     count = used[0]
     for i in range(turned.shape[0]):
-        a, b, c = turned[i, 0], turned[i, 1], turned[i, 2]
-        x = (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + base[i, 0] + s[0]) * scale + half
-        y = (m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + base[i, 1] + s[1]) * scale + half
-        if not (x >= np.float32(0.0) and y >= np.float32(0.0)):
+        at = pixel_of(i, points, scale, n)
+        if at < 0:
             continue
-        column, row = int(x), int(y)
-        if column >= n or row >= n:
-            continue
-        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + base[i, 2] + s[2]
-        at = row * n + column
+        z = m[2, 0] * turned[i, 0] + m[2, 1] * turned[i, 1] + m[2, 2] * turned[i, 2] + base[i, 2] + s[2]
         if flat_weight[at] == 0:
             touched[count] = at
             count += 1
@@ -169,7 +180,7 @@ def _add(turned: Any, base: Any, mat: Any, shift: Any, raster: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _finish(raster: Any, fill: int) -> None:
+def _finish(raster: RasterArrays, fill: int) -> None:
     _, height, weight, touched, used = raster
     n = height.shape[0]
     flat_height, flat_weight = height.ravel(), weight.ravel()
@@ -205,7 +216,7 @@ def _finish(raster: Any, fill: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _clear(raster: Any) -> None:
+def _clear(raster: RasterArrays) -> None:
     _, _, weight, touched, used = raster
     flat_weight = weight.ravel()
     for k in range(used[0]):
@@ -214,7 +225,7 @@ def _clear(raster: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _compare(raster: Any, reference: Any, loss: float, upright: Any) -> Any:
+def _compare(raster: RasterArrays, reference: RasterArrays, loss: float, upright: _Near) -> Any:
     pixel, height, _, touched, used = raster
     _, ref_height, ref_weight, _, _ = reference
     near, near_pixel, limit = upright
@@ -238,9 +249,9 @@ def _compare(raster: Any, reference: Any, loss: float, upright: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _evaluate(
-    turned: Any, base: Any, mat: Any, shift: Any, raster: Any, reference: Any, fill: int, loss: float, upright: Any
+    points: Trimmed, raster: RasterArrays, reference: RasterArrays, fill: int, loss: float, upright: _Near
 ) -> Any:
-    _add(turned, base, mat, shift, raster)
+    _add(points, raster)
     _finish(raster, fill)
     found = _compare(raster, reference, loss, upright)
     _clear(raster)

@@ -5,7 +5,7 @@ points are one line, whichever lasers hit it, so that rings of the scanner, whic
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,8 @@ from numba import njit
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
+Pixels = npt.NDArray[np.int32]
+Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +62,35 @@ class DistanceMap:
         )
 
 
+class Trimmed(NamedTuple):
+    """Points of a revolution and where a trim places them: mat turned + base + shift, from the middle of a raster.
+
+    Attributes
+    ----------
+    turned_m : ndarray of float32, shape (n, 3)
+        From the INS to the point, east north up: what a trim of an angle turns.
+    base_m : ndarray of float32, shape (n, 3)
+        Where the INS was when the point was measured, from where it was at the revolution's middle.
+    mat : ndarray of float32, shape (3, 3)
+        Turn by the trims.
+    shift_m : ndarray of float32, shape (3,)
+        From the raster's middle to the INS at the revolution's middle, trims included.
+    """
+
+    turned_m: Floats
+    base_m: Floats
+    mat: Floats
+    shift_m: Floats
+
+    @classmethod
+    def of(cls, turned_m: Floats, base_m: Floats, mat: Array, shift_m: Array) -> "Trimmed":
+        """In single precision."""
+        return cls(turned_m, base_m, mat.astype(np.float32), shift_m.astype(np.float32))
+
+
 def occupy(target: DistanceMap, turned_m: Floats, base_m: Floats, mat: Array, shift_m: Array) -> None:
     """Mark the pixels of points; arguments as of `ground_model.add`."""
-    _occupy(turned_m, base_m, mat, shift_m, target.pixel_m, target.state, target.touched, target.used)
+    _occupy(Trimmed.of(turned_m, base_m, mat, shift_m), target.pixel_m, target.state, target.touched, target.used)
 
 
 def spread(target: DistanceMap) -> None:
@@ -77,27 +105,35 @@ def clear(target: DistanceMap) -> None:
 
 def distance(target: DistanceMap, turned_m: Floats, base_m: Floats, mat: Array, shift_m: Array) -> float:
     """Sum of the squared distances of points [m2], those outside the map at the limit; arguments as of `ground_model.add`."""
-    return float(_distance(turned_m, base_m, mat, shift_m, target.pixel_m, target.distance_m, target.limit_m))
+    points = Trimmed.of(turned_m, base_m, mat, shift_m)
+    return float(_distance(points, target.pixel_m, target.distance_m, target.limit_m))
+
+
+@njit(cache=True, nogil=True, inline="always", fastmath=True)
+def pixel_of(i: int, points: Trimmed, scale: Any, n: int) -> Any:
+    """Flat index of the pixel that a point lies in, of a raster of n by n pixels, `scale` of them a metre; -1 outside."""
+    turned, base, m, s = points.turned_m, points.base_m, points.mat, points.shift_m
+    half = np.float32(0.5 * n)
+    a, b, c = turned[i, 0], turned[i, 1], turned[i, 2]
+    x = (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + base[i, 0] + s[0]) * scale + half
+    y = (m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + base[i, 1] + s[1]) * scale + half
+    at = -1
+    if x >= np.float32(0.0) and y >= np.float32(0.0):
+        column, row = int(x), int(y)
+        if column < n and row < n:
+            at = row * n + column
+    return at
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _occupy(turned: Any, base: Any, mat: Any, shift: Any, pixel: float, state: Any, touched: Any, used: Any) -> None:
+def _occupy(points: Trimmed, pixel: float, state: npt.NDArray[np.uint8], touched: Pixels, used: Ints) -> None:
     n = state.shape[0]
-    scale, half = np.float32(1.0 / pixel), np.float32(0.5 * n)
-    m, s = mat.astype(np.float32), shift.astype(np.float32)
+    scale = np.float32(1.0 / pixel)
     flat = state.ravel()
     count = used[0]
-    for i in range(turned.shape[0]):
-        a, b, c = turned[i, 0], turned[i, 1], turned[i, 2]
-        x = (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + base[i, 0] + s[0]) * scale + half
-        y = (m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + base[i, 1] + s[1]) * scale + half
-        if not (x >= np.float32(0.0) and y >= np.float32(0.0)):
-            continue
-        column, row = int(x), int(y)
-        if column >= n or row >= n:
-            continue
-        at = row * n + column
-        if flat[at] == 0:
+    for i in range(len(points.turned_m)):
+        at = pixel_of(i, points, scale, n)
+        if at >= 0 and flat[at] == 0:
             flat[at] = 1
             touched[count] = at
             count += 1
@@ -105,7 +141,7 @@ def _occupy(turned: Any, base: Any, mat: Any, shift: Any, pixel: float, state: A
 
 
 @njit(cache=True, nogil=True)
-def _spread(distances: Any, touched: Any, used: Any, disc: Any) -> None:
+def _spread(distances: Floats, touched: Pixels, used: Ints, disc: Floats) -> None:
     n = distances.shape[0]
     for k in range(used[0]):
         row, column = touched[k] // n, touched[k] % n
@@ -116,7 +152,9 @@ def _spread(distances: Any, touched: Any, used: Any, disc: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _clear(distances: Any, state: Any, touched: Any, used: Any, disc: Any, limit: Any) -> None:
+def _clear(
+    distances: Floats, state: npt.NDArray[np.uint8], touched: Pixels, used: Ints, disc: Floats, limit: np.float32
+) -> None:
     n = distances.shape[0]
     flat = state.ravel()
     for k in range(used[0]):
@@ -130,19 +168,13 @@ def _clear(distances: Any, state: Any, touched: Any, used: Any, disc: Any, limit
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _distance(turned: Any, base: Any, mat: Any, shift: Any, pixel: float, distances: Any, limit: float) -> float:
+def _distance(points: Trimmed, pixel: float, distances: Floats, limit: float) -> float:
     n = distances.shape[0]
-    scale, half = np.float32(1.0 / pixel), np.float32(0.5 * n)
-    m, s = mat.astype(np.float32), shift.astype(np.float32)
+    scale = np.float32(1.0 / pixel)
+    flat = distances.ravel()
     total = 0.0
-    for i in range(turned.shape[0]):
-        a, b, c = turned[i, 0], turned[i, 1], turned[i, 2]
-        x = (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + base[i, 0] + s[0]) * scale + half
-        y = (m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + base[i, 1] + s[1]) * scale + half
-        d = limit
-        if x >= np.float32(0.0) and y >= np.float32(0.0):
-            column, row = int(x), int(y)
-            if column < n and row < n:
-                d = np.float64(distances[row, column])
+    for i in range(len(points.turned_m)):
+        at = pixel_of(i, points, scale, n)
+        d = np.float64(flat[at]) if at >= 0 else limit
         total += d * d
     return total

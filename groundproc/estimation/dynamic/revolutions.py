@@ -13,9 +13,9 @@ from flightlog.constants import NS_PER_S
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.cloud import georeference
-from groundproc.cloud.placing import Tally, chunks
+from groundproc.flight.shots import shots as shots_of
 from groundproc.flight.timeline import Leg
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate, turns
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -24,8 +24,6 @@ Floats = npt.NDArray[np.float32]
 LONGEST_NS: Final = NS_PER_S // 2
 """A revolution that lasts longer has a hole in it: 5 Hz is the slowest the rotor turns."""
 LEAST_POINTS: Final = 100
-BEHIND_CDEG: Final = 18_000
-"""Azimuth at which revolutions are cut [0.01 deg]: straight behind, where the airframe hides the view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,25 +104,28 @@ def revolutions(
     """
     times: list[npt.NDArray[np.int64]] = []
     places: list[Array] = []
-    last_azimuth, last_ns, first_ns = -1, 0, 0
-    for packets, utc_ns in chunks(readers, timeline, Tally(), progress):
-        azimuth = (packets["data"]["blocks"]["azimuth"][:, 0].astype(np.int64) + BEHIND_CDEG) % 36_000
-        before = np.concatenate([[last_azimuth], azimuth[:-1]])
-        silent = np.diff(utc_ns, prepend=last_ns) > LONGEST_NS
-        cuts = np.flatnonzero((azimuth < before) | silent)
-        points = georeference.georeference(packets, utc_ns, trajectory, mount, gate)
-        edges = np.searchsorted(points.time_ns, utc_ns[cuts])
+    azimuth_rad: float | None = None
+    first_ns, last_ns = 0, 0
+    for shots in shots_of(readers, timeline, gate, progress=progress):
+        if not len(shots):
+            continue
+        # cut straight behind, where the airframe hides the view
+        silent = np.flatnonzero(np.diff(shots.time_ns, prepend=last_ns) > LONGEST_NS)
+        azimuth = shots.azimuth_rad
+        cuts = np.union1d(turns(azimuth, azimuth_rad), silent)
+        points = georeference.georeference(shots, trajectory, mount)
+        edges = np.searchsorted(points.time_ns, shots.time_ns[cuts])
         start = 0
         for cut, edge in zip(cuts, edges, strict=True):
             times.append(points.time_ns[start:edge])
             places.append(points.xyz_m[start:edge])
             if first_ns:
-                end_ns = int(utc_ns[cut - 1]) if cut else last_ns
+                end_ns = int(shots.time_ns[cut - 1]) if cut else last_ns
                 yield from _revolution(first_ns, end_ns, times, places, trajectory)
-            times, places, start, first_ns = [], [], edge, int(utc_ns[cut])
+            times, places, start, first_ns = [], [], edge, int(shots.time_ns[cut])
         times.append(points.time_ns[start:])
         places.append(points.xyz_m[start:])
-        last_azimuth, last_ns = int(azimuth[-1]), int(utc_ns[-1])
+        azimuth_rad, last_ns = float(azimuth[-1]), int(shots.time_ns[-1])
     if first_ns:
         yield from _revolution(first_ns, last_ns, times, places, trajectory)
 

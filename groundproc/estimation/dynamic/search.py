@@ -18,9 +18,9 @@ import numpy.typing as npt
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.dynamic import ground_model, plan
 from groundproc.estimation.dynamic.ground_model import Raster
-from groundproc.estimation.dynamic.options import DynamicOptions
 from groundproc.estimation.dynamic.plan import DistanceMap
 from groundproc.estimation.dynamic.revolutions import LONGEST_NS, Revolution
+from groundproc.survey.dynamic import DynamicOptions
 
 Array = npt.NDArray[np.float64]
 

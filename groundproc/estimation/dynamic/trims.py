@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +13,7 @@ from scipy.interpolate import CubicSpline
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
-from groundproc.estimation.dynamic.search import Found
-from groundproc.files import written_aside
+from groundproc.estimation.dynamic.search import VARIABLES, Found
 from groundproc.trajectory.table import from_poses
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -52,6 +51,23 @@ class Trims:
     course_rad: Array
     found: Sequence[Found]
 
+    def figures(self) -> dict[str, npt.NDArray[Any]]:
+        """The same as plain arrays, for the picture and the table.
+
+        trims.time_ns, heading_rad, course_rad; the trims yaw_rad, altitude_m, pitch_rad, roll_rad, x_m, y_m, shape (n,);
+        trims.ground_m, plan_m, shape (n, 2): RMSE before and after; trims.pixels, shape (n,).
+        """
+        units = {name: "rad" if name in ("yaw", "pitch", "roll") else "m" for name in VARIABLES}
+        return {
+            "trims.time_ns": self.time_ns,
+            "trims.heading_rad": self.heading_rad,
+            "trims.course_rad": self.course_rad,
+            **{f"trims.{name}_{unit}": self.values[:, i] for i, (name, unit) in enumerate(units.items())},
+            "trims.ground_m": np.array([each.ground_m for each in self.found], np.float64).reshape(-1, 2),
+            "trims.plan_m": np.array([each.plan_m for each in self.found], np.float64).reshape(-1, 2),
+            "trims.pixels": np.array([each.pixels for each in self.found], np.int64),
+        }
+
 
 def interpolated(time_ns: Times, values: Array, asked_ns: Times, rate_hz: float) -> Array:
     """Trims, shape (n, 6), at asked times, shape (m, 6), by a cubic spline on a grid of `rate_hz`; held beyond the first and the last."""
@@ -81,27 +97,12 @@ def applied(trajectory: Trajectory, values: Array) -> Trajectory:
         trajectory.sigma_position_m,
         trajectory.sigma_attitude_rad,
     )
-    return replace(made, covered=made.covered & trajectory.covered, interpolation=trajectory.interpolation)
-
-
-def write_trims(path: Path, trims: Trims) -> None:
-    """Write trims.csv, angles in degrees."""
-    degrees = np.rad2deg(trims.values)
-    rows = np.column_stack(
-        [
-            np.rad2deg(trims.heading_rad) % 360.0,
-            degrees[:, 0],
-            trims.values[:, 1],
-            degrees[:, 2:4],
-            trims.values[:, 4:6],
-            np.rad2deg(trims.course_rad),
-            [[*each.ground_m, *each.plan_m] for each in trims.found],
-        ]
+    return replace(
+        made,
+        covered=made.covered & trajectory.covered,
+        interpolation=trajectory.interpolation,
+        correlation=trajectory.correlation,
     )
-    with written_aside(path) as aside, aside.open("w", encoding="ascii", newline="\n") as file:
-        file.write(",".join(COLUMNS) + "\n")
-        for stamp, row, each in zip(trims.time_ns.tolist(), rows.tolist(), trims.found, strict=True):
-            file.write(f"{stamp},{','.join(f'{value:.4f}' for value in row)},{each.pixels}\n")
 
 
 def read_yaw(path: Path) -> tuple[Times, Array, Array]:

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import butter, sosfiltfilt
 
 from groundproc.flight.sync.tracks import low_pass
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -218,8 +219,8 @@ def align(
     found = expected
     for _ in range(4):
         left = slow - design @ found
-        spread = np.maximum(1.4826 * np.median(np.abs(left - np.median(left, axis=0)), axis=0), 1e-9)
-        weight = 1.0 / (1.0 + np.square(left / (3.0 * spread))) / spread**2
+        spread = np.maximum(robust.sigma_of_columns(left), 1e-9)
+        weight = robust.cauchy(left / (3.0 * spread)) / spread**2
         normal = np.einsum("nai,na,naj->ij", instrument, weight, design)
         for axis in range(3):
             part = slice(3 * axis, 3 * axis + 3)
@@ -305,7 +306,7 @@ def combine(
         predicted -= lever_rows @ alignment.lever_m
     difference = slow_value - predicted
     centre = np.median(difference, axis=0)
-    limit = 6.0 * 1.4826 * np.median(np.abs(difference - centre), axis=0)
+    limit = 6.0 * robust.sigma_of_columns(difference, centre)
     difference = np.clip(difference, centre - limit, centre + limit)
     both = _low_frequency_density(time_s, difference)
     other = np.maximum(both - own, 0.02 * own)

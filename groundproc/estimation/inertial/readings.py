@@ -14,6 +14,7 @@ from flightlog.mount import Mount
 from groundproc.estimation import ins
 from groundproc.estimation.inertial.imu import Samples, Signal, combine
 from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation.observations.measured import Stated
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.sync import GyroTrack
@@ -39,53 +40,17 @@ UNKNOWN_FORCE_DENSITY: Final = 1.0**2 * 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
-    """All that goes into the estimate of one leg. Times are seconds since `start_ns`.
+class Readings(Stated):
+    """All that goes into the estimate of one leg: what is stated, and the inertial sensors.
 
     Attributes
     ----------
-    start_ns : int
-        UTC of the first node.
-    step_ns : int
-    nodes_s : ndarray, shape (n,)
     gyro, force : Signal or None
         Body rate [rad/s] and specific force [m/s^2] in the ins frame over each step.
-    fix_s, fix_m, fix_sigma_m : ndarray, shape (f,), (f, 3), (f, 3)
-        Positions of the antenna.
-    fix_velocity_m_s : ndarray, shape (f, 3), or None
-        NaN where one is not known.
-    linked : bool
-        Velocities are those of the stated positions: both have the same error.
-    attitude_s, quat : ndarray, shape (a,), (a, 4)
-        As the autopilot has it.
-    baro_s, baro_m : ndarray, shape (b,)
-        Height by the standard atmosphere.
-    lever_m : ndarray, shape (3,)
-        The antenna in the ins frame.
-    outside : sequence of OutsideFixes
-    gravity_m_s2 : float
-    dropped_fixes : int
-        Left out because the receiver had no fix.
     """
 
-    start_ns: int
-    step_ns: int
-    nodes_s: Array
     gyro: Signal | None
     force: Signal | None
-    fix_s: Array
-    fix_m: Array
-    fix_sigma_m: Array
-    fix_velocity_m_s: Array | None
-    linked: bool
-    attitude_s: Array
-    quat: Array
-    baro_s: Array
-    baro_m: Array
-    lever_m: Array
-    outside: Sequence[OutsideFixes]
-    gravity_m_s2: float
-    dropped_fixes: int
 
 
 def normal_gravity(latitude_deg: float, height_m: float) -> float:
@@ -171,8 +136,6 @@ def read(
         start_ns,
         step_ns,
         nodes_s,
-        gyro,
-        force,
         seconds(fix_utc)[chosen],
         frame.from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)[chosen],
         fixes.sigma_m[chosen],
@@ -186,6 +149,8 @@ def read(
         [each.between(start_ns, start_ns + round(nodes_s[-1] * NS_PER_S)) for each in outside],
         normal_gravity(frame.latitude_deg, frame.height_m),
         int((~kept).sum()),
+        gyro,
+        force,
     )
 
 

@@ -1,5 +1,6 @@
 """The estimate: linearise about a reference, smooth, learn the noise from what is left, and again."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -10,8 +11,18 @@ from numba import njit
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.inertial import kalman
-from groundproc.estimation.inertial.measurements import KINDS, Builder, Reference, System
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.inertial.readings import (
+    UNKNOWN_FORCE_DENSITY,
+    UNKNOWN_RATE_DENSITY,
+    Readings,
+    drives,
+    standing,
+)
+from groundproc.estimation.inertial.transition import Motion
+from groundproc.estimation.method import Given
+from groundproc.estimation.observations import measured_of
+from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Reference, Rows, System
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     BARO,
     FIX_POSITION,
@@ -27,13 +38,9 @@ from groundproc.estimation.inertial.model import (
     fix_velocity_sigma,
     start_covariance,
 )
-from groundproc.estimation.inertial.readings import (
-    UNKNOWN_FORCE_DENSITY,
-    UNKNOWN_RATE_DENSITY,
-    Readings,
-    drives,
-    standing,
-)
+from groundproc.flight.timeline import Leg
+from groundproc.numerics import robust
+from groundproc.numerics.rotations import quat_difference_outside, quat_multiply, quat_turned_by
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -118,19 +125,25 @@ class _Imu:
     force_known: Mask
 
 
-def solve(readings: Readings, model: Model | None = None) -> Solution:
+def solve(
+    readings: Readings, model: Model | None = None, given: Given | None = None, leg: Leg | None = None
+) -> Solution:
     """Estimate one leg.
 
     Parameters
     ----------
     readings : Readings
     model : Model, optional
+    given : Given, optional
+    leg : Leg, optional
+        The flight, and which part of it this is, for observations that bring something of their own.
     """
     model = Model() if model is None else model
     imu = _imu(readings)
     reference = _start(readings, imu)
     stands, driving = standing(readings), drives(readings)
-    builder = Builder(readings, stands, driving)
+    sources = measured_of(Heard(readings, stands, driving, given, leg))
+    noise = {kind: learnt for source in sources for kind, learnt in source.learnt.items()}
     first = reference
     stride = max(KEPT_NS // readings.step_ns, 1)
     nodes = len(readings.nodes_s)
@@ -140,12 +153,12 @@ def solve(readings: Readings, model: Model | None = None) -> Solution:
     weight: Array | None = None
     moved = (np.inf, np.inf)
     iteration = 0
-    system = builder.system(reference, imu.rate, model)
+    system = _system(sources, readings, reference, imu.rate, model)
     residual = np.zeros(len(system.measured))
     while iteration < ITERATIONS:
         iteration += 1
         if iteration > 1:
-            system = builder.system(reference, imu.rate, model)
+            system = _system(sources, readings, reference, imu.rate, model)
         variance = system.variance if weight is None else system.variance / weight
         correction = _smooth(
             readings,
@@ -169,8 +182,8 @@ def solve(readings: Readings, model: Model | None = None) -> Solution:
             break
         if iteration < ITERATIONS:
             if iteration <= 3:
-                model = _learnt(model, system, residual, states, spread)
-            weight = 1.0 / (1.0 + np.square(residual / _noise(system, model) / OUTLIER))
+                model = _learnt(model, noise, system, residual, states, spread)
+            weight = robust.cauchy(residual / _noise(noise, system, model) / OUTLIER)
     return _solution(
         readings,
         model,
@@ -236,29 +249,25 @@ def _start(r: Readings, imu: _Imu) -> Reference:
 
 
 @njit(cache=True, nogil=True)
-def _join(angle: Any, place: Any, given: Any, out: Any) -> None:
+def _join(angle: Array, place: npt.NDArray[np.int64], given: Array, out: Array) -> None:
     """Attitudes on nodes: turned on from each given one by the gyros, what is missed at the next one spread evenly before it."""
     nodes = len(out)
-    missed, part, unit, turned = np.empty(3), np.empty(4), np.array([1.0, 0.0, 0.0, 0.0]), np.empty(4)
+    missed, part, unit = np.empty(3), np.empty(4), np.array([1.0, 0.0, 0.0, 0.0])
     out[place[0]] = given[0]
     for k in range(place[0] - 1, -1, -1):
-        kalman.turn_on(out[k + 1], angle[k], -1.0, out[k])
+        quat_turned_by(out[k + 1], angle[k], -1.0, out[k])
     for i in range(len(place)):
         low = place[i]
         high = place[i + 1] if i + 1 < len(place) else nodes - 1
         out[low] = given[i]
         for k in range(low, high):
-            kalman.turn_on(out[k], angle[k], 1.0, out[k + 1])
+            quat_turned_by(out[k], angle[k], 1.0, out[k + 1])
         if i + 1 == len(place):
             break
-        kalman.turned_between(given[i + 1], out[high], missed)
+        quat_difference_outside(given[i + 1], out[high], missed)
         for k in range(low + 1, high):
-            kalman.turn_on(unit, missed, (k - low) / (high - low), part)
-            turned[:] = out[k]
-            out[k, 0] = part[0] * turned[0] - part[1] * turned[1] - part[2] * turned[2] - part[3] * turned[3]
-            out[k, 1] = part[0] * turned[1] + part[1] * turned[0] + part[2] * turned[3] - part[3] * turned[2]
-            out[k, 2] = part[0] * turned[2] - part[1] * turned[3] + part[2] * turned[0] + part[3] * turned[1]
-            out[k, 3] = part[0] * turned[3] + part[1] * turned[2] - part[2] * turned[1] + part[3] * turned[0]
+            quat_turned_by(unit, missed, (k - low) / (high - low), part)
+            quat_multiply(part, out[k], out[k])
 
 
 def _smooth(
@@ -311,22 +320,17 @@ def _smooth(
         frames.quat_multiply(first.quat[0], frames.quat_inverse(reference.quat[0]))
     )
     correction = np.empty((len(r.nodes_s), POSE))
+    motion = Motion(
+        reference.position_m, reference.velocity_m_s, reference.quat, step_s, imu.rate * step_s[:, None], force * step_s[:, None],
+        imu.rate_density, imu.force_density, r.gravity_m_s2, keep, drive,
+    )  # fmt: skip
+    out = kalman.Smoothed(stride, correction, residual, states, covariance, spread)
     kalman.smooth(
-        (reference.position_m, reference.velocity_m_s, reference.quat),
-        (step_s, imu.rate * step_s[:, None], force * step_s[:, None], imu.rate_density, imu.force_density),
-        r.gravity_m_s2,
-        keep,
-        drive,
-        system.first,
-        system.rows(),
+        motion,
+        kalman.Rows(system.first, system.count, system.index, system.value, system.measured, system.variance),
         start,
         start_covariance(model, fix_sigma, r.linked),
-        stride,
-        correction,
-        residual,
-        states,
-        covariance,
-        spread,
+        out,
     )
     return correction
 
@@ -340,31 +344,31 @@ def _corrected(reference: Reference, correction: Array) -> Reference:
     )
 
 
-_LEARNT: Final = {
-    "fix position": ("fix_noise_m", 0.02, 5.0),
-    "fix velocity": ("fix_velocity_noise_m_s", 0.02, 3.0),
-    "tilt": ("tilt_noise_rad", np.deg2rad(0.02), np.deg2rad(2.0)),
-    "heading": ("heading_noise_rad", np.deg2rad(0.02), np.deg2rad(5.0)),
-    "barometer": ("baro_noise_m", 0.05, 5.0),
-}
-"""White noise that the residuals tell: field of Model, least, most."""
+def _system(sources: Sequence[Measured], r: Readings, reference: Reference, rates: Array, model: Model) -> System:
+    """The rows of all observations about a reference."""
+    rows = Rows(reference, rates, model, r.nodes_s, r.step_ns)
+    for source in sources:
+        source.rows(rows)
+    return rows.system()
 
 
-def _noise(system: System, model: Model) -> Array:
-    """Sigma of each row's noise by the model; one for whitened rows."""
+def _noise(learnt: Mapping[str, Learnt], system: System, model: Model) -> Array:
+    """Sigma of each row's noise by the model; as stated where none is learnt."""
     sigma = np.sqrt(system.variance)
-    for kind, (name, _, _) in _LEARNT.items():
-        sigma[system.kind == KINDS.index(kind)] = getattr(model, name)
+    for kind, each in learnt.items():
+        sigma[system.of(kind)] = getattr(model, each.field)
     return np.asarray(sigma)
 
 
-def _learnt(model: Model, system: System, residual: Array, states: Array, variance: Array) -> Model:
+def _learnt(
+    model: Model, noise: Mapping[str, Learnt], system: System, residual: Array, states: Array, variance: Array
+) -> Model:
     """White noise from the residuals' median, and the size of the correlated errors from the states themselves (expectation step)."""
     changed: dict[str, Any] = {}
-    for kind, (name, least, most) in _LEARNT.items():
-        chosen = residual[system.kind == KINDS.index(kind)]
+    for kind, each in noise.items():
+        chosen = residual[system.of(kind)]
         if len(chosen) >= 50:
-            changed[name] = float(np.clip(1.4826 * np.median(np.abs(chosen)), least, most))
+            changed[each.field] = float(np.clip(robust.sigma(chosen, 0.0), each.least, each.most))
     for name, part, least, most in (
         ("tilt_rad", slice(TILT, TILT + 2), np.deg2rad(0.2), np.deg2rad(10.0)),
         ("heading_rad", slice(HEADING, HEADING + 1), np.deg2rad(0.3), np.deg2rad(20.0)),
@@ -397,7 +401,7 @@ def _solution(
     bias = np.stack([np.interp(time_ns, kept_ns, states[:, GYRO_BIAS + i]) for i in range(3)], axis=1)
     rate = np.concatenate([imu.rate[:1], 0.5 * (imu.rate[1:] + imu.rate[:-1]), imu.rate[-1:]]) - bias
     rms, count, outliers = {}, {}, {}
-    for number, kind in enumerate(KINDS):
+    for number, kind in enumerate(system.kinds):
         chosen = system.kind == number
         if chosen.any():
             rms[kind] = float(np.sqrt(np.mean(residual[chosen] ** 2)))

@@ -5,9 +5,15 @@ motion      rates and specific force of all inertial sensors on that grid
 slices      shots to slices of 0.1 s, and each slice to clusters: the returns of one voxel at one instant
 clusters    clusters of many slices, as columns
 voxels      a map of planes in a hash of voxels
-spline      uniform cubic B-splines, and the path that they correct
-stated      positions and attitudes of the autopilot
-odometry    an iterated error-state filter; the causal mode
-track       the forward pass: start, silent slices, fixes, loss of way
+spline      the path of the sensor, and the spline that corrects it
+stated      positions and attitudes of the autopilot, as they become known
+state       where the sensor is, and how the inertial data carry that on
+matching    distances of clusters from the map, and the correction by them
+odometry    the two as an iterated error-state filter; the causal mode
+start       the rough pose that it begins from
+bearing     the heading of its map against the earth's
+history     where the sensor was in the last seconds
+tracker     the forward pass over a recording or a flight that goes on: start, silent slices, fixes, loss of way
+track       what the forward pass found
 beginning   the first seconds again, backwards
 """

@@ -14,8 +14,9 @@ import numpy as np
 from flightlog import frames
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.motion import Motion
-from groundproc.estimation.odometry.odometry import STATES, Odometry, State, Step
+from groundproc.estimation.odometry.odometry import Odometry, Step
 from groundproc.estimation.odometry.slices import Slice
+from groundproc.estimation.odometry.state import STATES, State
 from groundproc.estimation.odometry.track import KEPT, Track, thinned
 from groundproc.estimation.odometry.voxels import PlaneMap
 

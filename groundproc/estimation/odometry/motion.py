@@ -5,7 +5,7 @@ the autopilot's (10 to 400 Hz through MAVLink, better, stamped by another clock)
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from groundproc.estimation.method import Given
 from groundproc.estimation.odometry.grid import STEP_NS
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg, LidarRun
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -119,10 +120,39 @@ def _felt(boot: Boot, name: str) -> bool:
 
 def _noise(samples: Array) -> float:
     """White noise of a sample from second differences, which smooth motion hardly enters: robust, all axes together."""
-    second = samples[2:] - 2.0 * samples[1:-1] + samples[:-2]
-    if not len(second) or not np.isfinite(second).all():
+    if len(samples) < 3 or not np.isfinite(samples).all():
         return float("nan")
-    return float(1.4826 * np.median(np.abs(second - np.median(second, axis=0))) / np.sqrt(6.0))
+    return robust.white_noise(samples)
+
+
+class MotionGrid(Protocol):
+    """What the odometry needs of the motion: of a whole recording, or of a flight that goes on.
+
+    Attributes
+    ----------
+    start_ns : int
+        Start of the grid; step i is from start_ns + i STEP_NS to the next.
+    rate_rad_s, force_m_s2 : ndarray, shape (n, 3)
+        Mean rate and specific force of each step, sensor frame.
+    known : ndarray of bool, shape (n,)
+        Whether samples say it.
+    rate_density, force_density : float
+        Noise as in `ImuTrack`.
+    """
+
+    @property
+    def start_ns(self) -> int: ...  # noqa: D102
+    @property
+    def rate_rad_s(self) -> Array: ...  # noqa: D102
+    @property
+    def force_m_s2(self) -> Array: ...  # noqa: D102
+    @property
+    def known(self) -> npt.NDArray[np.bool_]: ...  # noqa: D102
+    @property
+    def rate_density(self) -> float: ...  # noqa: D102
+    @property
+    def force_density(self) -> float: ...  # noqa: D102
+    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,3 +255,13 @@ def _filled(
     if both.any() and missing.any():
         values[missing] = second[missing] + (values[both] - second[both]).mean(axis=0)
     return np.asarray(known | (second_known if both.any() else known))
+
+
+def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) -> Array:
+    """Where to begin with the bias of the gyro that carries the motion: its mean difference from the autopilot's, which has a small one."""
+    if own is None or other is None or motion.source != own.name:
+        return np.zeros(3)
+    rate, known = on_grid(other.time_ns, other.rate_rad_s, motion.start_ns, len(motion))
+    own_rate, own_known = on_grid(own.time_ns, own.rate_rad_s, motion.start_ns, len(motion))
+    both = known & own_known
+    return np.asarray((own_rate - rate)[both].mean(axis=0)) if both.any() else np.zeros(3)

@@ -6,21 +6,23 @@ mean is one measurement of a surface from one pose, with the noise of the ranges
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud import placing as cloud
 from groundproc.estimation.method import Given, Progress
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS
+from groundproc.estimation.odometry.spline import PathArrays
+from groundproc.flight.shots import shots as shots_of
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.voxelhash import spread, voxel_key
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 
 Array = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
 
 CLUSTER_DTYPE: Final = np.dtype(
     [
@@ -68,7 +70,6 @@ def slices(given: Given, start_ns: int, progress: Progress, apart: bool = False)
     """
     survey = given.survey
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
-    tally = cloud.Tally()
     times: list[npt.NDArray[np.int64]] = []
     points: list[npt.NDArray[np.float32]] = []
     lines: list[npt.NDArray[np.uint8]] = []
@@ -77,8 +78,7 @@ def slices(given: Given, start_ns: int, progress: Progress, apart: bool = False)
     def told(done: int) -> None:
         progress("adjust", done)
 
-    for packets, utc_ns in cloud.chunks(given.readers, given.timeline, tally, told):
-        shots = decode.decode(packets, utc_ns, gate, given.lasers)
+    for shots in shots_of(given.readers, given.timeline, gate, given.lasers, progress=told):
         # at a change of leg the clock may step back by what the synchronisations differ by
         slot = (shots.time_ns - start_ns) // SLICE_NS
         edges = np.flatnonzero(np.diff(slot)) + 1
@@ -149,26 +149,59 @@ class Clusterer:
         sums = np.zeros((min(count, TABLE_SIZE // 2), 15))
         laser = piece.laser if apart and piece.laser is not None else np.zeros(count, np.uint8)
         lasers = np.zeros(len(sums), np.int32)
-        found = _gather(
-            piece.time_ns, piece.xyz_m, laser, start_ns, quat, position_m, self.voxel_m, self._table, self._keys, sums,
-            lasers,
-        )  # fmt: skip
+        poses = PathArrays(start_ns, STEP_NS, quat, position_m)
+        table = _Table(self.voxel_m, self._table, self._keys)
+        found = _gather(_Returns(piece.time_ns, piece.xyz_m, laser), poses, table, sums, lasers)
         clusters = np.empty(found, CLUSTER_DTYPE)
         world = np.empty((found, 3))
-        _finish(
-            sums[:found], start_ns, quat, position_m, clusters["time_ns"], clusters["xyz"], clusters["scatter"],
-            clusters["count"], clusters["range_m"], world,
-        )  # fmt: skip
+        columns = _Columns(
+            clusters["time_ns"], clusters["xyz"], clusters["scatter"], clusters["count"], clusters["range_m"]
+        )
+        _finish(sums[:found], poses, columns, world)
         clusters["laser"] = lasers[:found]
         return clusters, world
 
 
+class _Returns(NamedTuple):
+    """Returns of a slice; the fields are those of `Slice`, lasers of zeros where they are not told apart."""
+
+    time_ns: Ints
+    xyz_m: Singles
+    laser: npt.NDArray[np.uint8]
+
+
+class _Table(NamedTuple):
+    """Working memory for voxels, empty before and after.
+
+    Attributes
+    ----------
+    voxel_m : float
+    rows : ndarray of int32, shape (TABLE_SIZE,)
+        Of the sums, by the hashes of the voxels' keys; -1: none.
+    keys : ndarray of int64, shape (TABLE_SIZE,)
+    """
+
+    voxel_m: float
+    rows: npt.NDArray[np.int32]
+    keys: Ints
+
+
+class _Columns(NamedTuple):
+    """Columns of clusters to be filled in: of CLUSTER_DTYPE, and described there."""
+
+    time_ns: Ints
+    xyz_m: Singles
+    scatter_m2: Singles
+    returns: npt.NDArray[np.int32]
+    range_m: Singles
+
+
 @njit(cache=True, nogil=True)
-def _gather(
-    time_ns: Any, xyz: Any, laser: Any, start_ns: int, quat: Any, position: Any, voxel_m: float, table: Any, keys: Any, sums: Any,
-    lasers: Any,
-) -> int:  # fmt: skip
+def _gather(returns: _Returns, poses: PathArrays, voxels: _Table, sums: Array, lasers: npt.NDArray[np.int32]) -> int:
     """Sums of each voxel and laser: count, time, world x y z, its six second moments, range; about the voxel's centre, which follows."""
+    time_ns, xyz, laser = returns
+    voxel_m, table, keys = voxels
+    start_ns, quat, position = poses.start_ns, poses.quat, poses.position_m
     nodes = len(quat)
     mats = np.empty((nodes, 3, 3))
     for i in range(nodes):
@@ -181,7 +214,7 @@ def _gather(
         since = time_ns[n] - start_ns
         if since != last:
             last = since
-            u = since / STEP_NS
+            u = since / poses.step_ns
             i = min(max(int(u), 0), nodes - 2)
             u -= i
             # between nodes a point moves on a straight line: a sagitta of theta^2 / 8, 3e-6 rad at 60 deg/s
@@ -231,10 +264,10 @@ def _gather(
 
 
 @njit(cache=True, nogil=True)
-def _finish(
-    sums: Any, start_ns: int, quat: Any, position: Any, time_ns: Any, xyz: Any, scatter: Any, count: Any, range_m: Any,
-    world: Any,
-) -> None:  # fmt: skip
+def _finish(sums: Array, poses: PathArrays, columns: _Columns, world: Array) -> None:
+    """Mean, scatter, time and range of each voxel from its sums; its mean in the sensor frame at that time."""
+    start_ns, quat, position = poses.start_ns, poses.quat, poses.position_m
+    time_ns, xyz, scatter, count, range_m = columns
     nodes = len(quat)
     mats = np.empty((nodes, 3, 3))
     for i in range(nodes):
@@ -252,7 +285,7 @@ def _finish(
         world[row, 0], world[row, 1], world[row, 2] = x + s[12], y + s[13], z + s[14]
         since = s[1] * n
         time_ns[row] = start_ns + np.int64(np.rint(since))
-        u = since / STEP_NS
+        u = since / poses.step_ns
         i = min(max(int(u), 0), nodes - 2)
         u -= i
         for c in range(3):

@@ -1,10 +1,7 @@
-"""Uniform cubic B-splines with a knot at every slice boundary, and the path they correct.
-
-In the interval from knot k to k + 1 the coefficients k to k + 3 count, with the weights of `basis`; n intervals have n + 3 coefficients.
-"""
+"""The path of the sensor on the grid, and the spline that corrects it."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,23 +11,18 @@ from scipy.interpolate import CubicSpline
 from flightlog import frames
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.numerics.rotations import quat_turned
+from groundproc.numerics.splines import value_at
 
 Array = npt.NDArray[np.float64]
 
-DEGREE: Final = 3
 
+class PathArrays(NamedTuple):
+    """A `Path` as kernels take it; its fields stand there."""
 
-@njit(cache=True, nogil=True, inline="always")
-def basis(u: float) -> Any:
-    """The four weights at u in [0, 1]."""
-    v = 1.0 - u
-    u2 = u * u
-    return (
-        v * v * v / 6.0,
-        (4.0 - 6.0 * u2 + 3.0 * u2 * u) / 6.0,
-        (1.0 + 3.0 * u + 3.0 * u2 - 3.0 * u2 * u) / 6.0,
-        u2 * u / 6.0,
-    )
+    start_ns: int
+    step_ns: int
+    quat: Array
+    position_m: Array
 
 
 @dataclass(slots=True)
@@ -58,6 +50,11 @@ class Path:
         """Slices it covers."""
         return (len(self.quat) - 1) // STEPS
 
+    @property
+    def arrays(self) -> PathArrays:
+        """What the kernels take."""
+        return PathArrays(self.start_ns, self.step_ns, self.quat, self.position_m)
+
     def corrected(self, coefficients: Array) -> "Path":
         """The path turned (in the body) and moved by a spline: coefficients of shape (intervals + 3, 6), rotation vector first."""
         quat, position = np.empty_like(self.quat), np.empty_like(self.position_m)
@@ -76,19 +73,12 @@ class Path:
 
 
 @njit(cache=True, nogil=True)
-def _correct(quat: Any, position: Any, coefficients: Any, out_quat: Any, out_position: Any) -> None:
+def _correct(quat: Array, position: Array, coefficients: Array, out_quat: Array, out_position: Array) -> None:
     last = len(coefficients) - 4
     value = np.empty(6)
     for i in range(len(quat)):
         k = min(i // STEPS, last)
-        w0, w1, w2, w3 = basis((i - k * STEPS) / STEPS)
-        for c in range(6):
-            value[c] = (
-                w0 * coefficients[k, c]
-                + w1 * coefficients[k + 1, c]
-                + w2 * coefficients[k + 2, c]
-                + w3 * coefficients[k + 3, c]
-            )
+        value_at(coefficients, k, (i - k * STEPS) / STEPS, value)
         quat_turned(quat[i], value[0], value[1], value[2], out_quat[i])
         for c in range(3):
             out_position[i, c] = position[i, c] + value[3 + c]
@@ -103,7 +93,7 @@ def integrated(rate_rad_s: Array, start: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _integrate(turn: Any, quat: Any) -> None:
+def _integrate(turn: Array, quat: Array) -> None:
     for i in range(len(turn)):
         quat_turned(quat[i], turn[i, 0], turn[i, 1], turn[i, 2], quat[i + 1])
 

@@ -1,15 +1,17 @@
 """A map of planes: second moments of the returns in each voxel of a hash that grows."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.numerics.rotations import flattest
+from groundproc.numerics.planes import add_scatter, flattest_of
 from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
+Table = npt.NDArray[np.int32]
+Keys = npt.NDArray[np.int64]
 
 COUNT, MEAN, SCATTER, NORMAL, LEVEL, FLATNESS, TILT = 0, 1, 4, 10, 13, 14, 15
 """Columns of a voxel: returns; their mean (3); scatter about it (6); normal (3); its distance from the origin; variance along it,
@@ -24,6 +26,24 @@ FLATTEST_M: Final = 0.05
 """Deviation from a plane beyond which a voxel is none, one sigma [m]."""
 NARROWEST: Final = 0.16
 """Least width of the returns across the plane's narrow side, one sigma, in voxels: a single ring on the ground is no plane."""
+
+
+class MapArrays(NamedTuple):
+    """A `PlaneMap` as kernels take it.
+
+    Attributes
+    ----------
+    table : ndarray of int32, shape (a power of two,)
+        Rows of the voxels by the hashes of their keys; -1: none.
+    keys : ndarray of int64, shape (rows,)
+    voxels : ndarray, shape (rows, COLUMNS)
+    voxel_m : float
+    """
+
+    table: Table
+    keys: Keys
+    voxels: Array
+    voxel_m: float
 
 
 class PlaneMap:
@@ -45,10 +65,12 @@ class PlaneMap:
         """Add clusters whose means lie at `world_m`, shape (m, 3); a voxel forgets beyond `most` returns."""
         if self.count + len(world_m) > len(self.keys) or 2 * (self.count + len(world_m)) > len(self.table):
             self._grow()
-        self.count = _insert(
-            self.table, self.keys, self.voxels, self.count, world_m, clusters["scatter"], clusters["count"],
-            self.voxel_m, most,
-        )  # fmt: skip
+        self.count = _insert(self.arrays, self.count, world_m, clusters["scatter"], clusters["count"], most)
+
+    @property
+    def arrays(self) -> MapArrays:
+        """What the kernels take."""
+        return MapArrays(self.table, self.keys, self.voxels, self.voxel_m)
 
     def forget_beyond(self, centre_m: Array, distance_m: float) -> None:
         """Drop what lies farther away than a distance: bounds the memory of a long flight."""
@@ -71,7 +93,7 @@ class PlaneMap:
 
 
 @njit(cache=True, nogil=True)
-def _index(table: Any, keys: Any, count: int) -> None:
+def _index(table: Table, keys: Keys, count: int) -> None:
     mask = len(table) - 1
     for row in range(count):
         slot = spread(keys[row]) & mask
@@ -81,7 +103,7 @@ def _index(table: Any, keys: Any, count: int) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def find(table: Any, keys: Any, key: Any) -> Any:
+def find(table: Table, keys: Keys, key: int) -> Any:
     """Row of a voxel, -1 where there is none."""
     mask = len(table) - 1
     slot = spread(key) & mask
@@ -94,8 +116,9 @@ def find(table: Any, keys: Any, key: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _insert(
-    table: Any, keys: Any, voxels: Any, count: int, world: Any, scatter: Any, counts: Any, voxel_m: float, most: float
-) -> int:
+    planes: MapArrays, count: int, world: Array, scatter: npt.NDArray[np.float32], counts: npt.NDArray[np.int32], most: float
+) -> int:  # fmt: skip
+    table, keys, voxels, voxel_m = planes
     mask, per_m = len(table) - 1, 1.0 / voxel_m
     normal = np.empty(3)
     for n in range(len(world)):
@@ -124,19 +147,11 @@ def _insert(
         v[MEAN] += share * dx
         v[MEAN + 1] += share * dy
         v[MEAN + 2] += share * dz
-        v[SCATTER] += scatter[n, 0] + weight * dx * dx
-        v[SCATTER + 1] += scatter[n, 1] + weight * dx * dy
-        v[SCATTER + 2] += scatter[n, 2] + weight * dx * dz
-        v[SCATTER + 3] += scatter[n, 3] + weight * dy * dy
-        v[SCATTER + 4] += scatter[n, 4] + weight * dy * dz
-        v[SCATTER + 5] += scatter[n, 5] + weight * dz * dz
+        add_scatter(v[SCATTER : SCATTER + 6], 1.0, scatter[n], weight, (dx, dy, dz))
         v[FLATNESS] = -1.0
         if total >= FEWEST:
             s = 1.0 / total
-            low, middle = flattest(
-                s * v[SCATTER], s * v[SCATTER + 1], s * v[SCATTER + 2], s * v[SCATTER + 3], s * v[SCATTER + 4],
-                s * v[SCATTER + 5], normal,
-            )  # fmt: skip
+            low, middle = flattest_of(v[SCATTER : SCATTER + 6], s, normal)
             if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
                 v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
                 v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]

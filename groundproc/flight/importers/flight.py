@@ -13,10 +13,13 @@ from typing import Any, BinaryIO
 
 from flightlog import __version__
 from flightlog.clock import utc_text
-from flightlog.errors import CaptureError, LogError, UsageError
+from flightlog.errors import CaptureError, LogError, UsageError, WrongSensorError
 from flightlog.logfile import LogWriter
+from groundproc import sensors
 from groundproc.flight.importers.joining import Event, Joiner
 from groundproc.flight.importers.sources import Capture, DataflashLog, Ports, Source, Tlog, open_mavlink
+from groundproc.flight.lidar import STATED
+from groundproc.sensors.model import Lidar
 
 LINK = "ins"
 """The autopilot that measures: what these recordings are of."""
@@ -116,8 +119,9 @@ def _write(
     streams = [source.events() for source in sources if isinstance(source, (Capture, Tlog))]
     events = heapq.merge(*streams, key=attrgetter("time_ns"))
     first = next(events, None)
-    joiner = Joiner()
-    session = {"origin": "import", "version": __version__}
+    lidar_model = _lidar(sources)
+    joiner = Joiner(lidar_model)
+    session = {"origin": "import", "version": __version__, STATED[1]: lidar_model.name}
     writer = LogWriter(
         stream, metadata={"swath.session": session}, attachments=attachments, library=f"swath {__version__}"
     )
@@ -147,6 +151,22 @@ def _write(
     return result
 
 
+def _lidar(sources: Sequence[Source]) -> Lidar:
+    """The lidar of all captures; the flown model where none of them tells.
+
+    Raises
+    ------
+    WrongSensorError
+        They are of different ones.
+    """
+    told = {s.lidar.name: s for s in sources if isinstance(s, Capture) and s.lidar is not None}
+    if len(told) > 1:
+        raise WrongSensorError(
+            "; ".join(f"{source.path}: is of a {name}" for name, source in told.items()) + "; one flight has one lidar"
+        )
+    return sensors.lidar(next(iter(told), sensors.FLOWN))
+
+
 def _counted(events: Iterator[Event], progress: Callable[[int], object] | None) -> Iterator[Event]:
     if progress is None:
         yield from events
@@ -166,12 +186,12 @@ def _check(joiner: Joiner, sources: Sequence[Source]) -> None:
     damage = "; ".join(f"it {capture.found.damage}" for capture in captures if capture.found.damage)
     ports = {port for capture in captures for port, size in capture.other_ports.items() if size > 1000}
     if lidar.received:
-        reason = f"{lidar.received} packets came to its port, none of them an HDL-32E's"
+        reason = f"{lidar.received} packets came to its port, none of them a {joiner.lidar.name}'s"
     elif ports:
         reason = f"packets of the right size went to UDP port {min(ports)}: try --lidar-port {min(ports)}"
     else:
         reason = damage or f"{sum(c.found.packets for c in captures)} packets seen, none to the lidar's UDP port"
-    raise CaptureError(f"{names}: holds no packet of an HDL-32E ({reason})")
+    raise CaptureError(f"{names}: holds no packet of a lidar ({reason})")
 
 
 def _overlap_notes(sources: Sequence[Source]) -> list[str]:
@@ -194,7 +214,7 @@ def _packet_notes(joiner: Joiner) -> list[str]:
         notes.append("no lidar data packet was found, position packets only")
     for name in ("rejected_length", "rejected_content", "rejected_sender"):
         if count := getattr(lidar, name):
-            what = {"rejected_length": "of a wrong length", "rejected_content": "that are no HDL-32E's"}
+            what = {"rejected_length": "of a wrong length", "rejected_content": f"that are no {joiner.lidar.name}'s"}
             notes.append(f"{count} packets {what.get(name, 'of a second sender')} on the lidar's port left out")
     if joiner.count.position_rejected:
         notes.append(f"{joiner.count.position_rejected} packets on the position port left out")

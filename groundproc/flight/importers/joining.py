@@ -13,6 +13,8 @@ import numpy as np
 from flightlog import hdl32e, records
 from flightlog.constants import NS_PER_MS
 from flightlog.records import LidarAccount
+from groundproc.sensors import velodyne
+from groundproc.sensors.model import Lidar
 
 SLOT_NS: Final = 100 * NS_PER_MS
 _LARGEST_SLOT: Final = 4096
@@ -80,8 +82,15 @@ class SensorCount:
 
 @dataclass(slots=True)
 class Joiner:
-    """Turns events into messages; `count` says what became of them."""
+    """Turns events into messages; `count` says what became of them.
 
+    Attributes
+    ----------
+    lidar : Lidar
+        Whose packets are kept.
+    """
+
+    lidar: Lidar
     count: SensorCount = field(default_factory=SensorCount)
     _sender: bytes = b""
 
@@ -113,7 +122,7 @@ class Joiner:
     def _lidar(self, events: list[Event]) -> list[LogMessage]:
         right = [event for event in events if len(event.data) == hdl32e.DATA_BYTES]
         data = np.frombuffer(b"".join(event.data for event in right), hdl32e.DATA_DTYPE)
-        valid = hdl32e.is_data(data)
+        valid = self.lidar.valid(data)
         if not self._sender and valid.any():
             self._sender = right[int(np.argmax(valid))].sender
         ours = np.fromiter((event.sender == self._sender for event in right), np.bool_, len(right))
@@ -138,10 +147,10 @@ class Joiner:
 
     def _position(self, events: list[Event]) -> list[LogMessage]:
         right = [event for event in events if len(event.data) == hdl32e.POSITION_BYTES]
-        packets = np.frombuffer(b"".join(event.data for event in right), hdl32e.POSITION_DTYPE)
+        packets = velodyne.position_packets(b"".join(event.data for event in right))
         kept = [
             event
-            for event, good in zip(right, hdl32e.is_position(packets), strict=True)
+            for event, good in zip(right, velodyne.is_position(packets), strict=True)
             if good and self._sender in (b"", event.sender)
         ]
         self.count.position_received += len(events)

@@ -14,9 +14,11 @@ import numpy as np
 from flightlog import dataflash, hdl32e, records
 from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
+from groundproc import sensors
 from groundproc.flight.importers import pcap, tlog, udp
 from groundproc.flight.importers.joining import Event, LogMessage, Steady
-from groundproc.sensors.identity import refuse_other_models
+from groundproc.flight.lidar import recognised
+from groundproc.sensors.model import Lidar
 
 _PROBE_PACKETS: Final = 64
 _PROBE_DATAGRAMS: Final = 2000
@@ -97,6 +99,8 @@ class Capture:
     """
 
     kind = "capture"
+    lidar: Lidar | None
+    """The model of its packets; None where it holds no data packet, or none that tells."""
 
     def __init__(self, path: Path, ports: Ports) -> None:
         self.path = path
@@ -115,7 +119,7 @@ class Capture:
             raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
 
     def _probe(self) -> list[udp.Datagram]:
-        """Take the first datagrams and refuse another sensor by them."""
+        """Take the first datagrams, and recognise the sensor by them."""
         head: list[udp.Datagram] = []
         lidar: list[bytes] = []
         for datagram in self._stream:
@@ -125,10 +129,7 @@ class Capture:
             if len(lidar) >= _PROBE_PACKETS or len(head) >= _PROBE_DATAGRAMS:
                 break
         packets = np.frombuffer(b"".join(lidar), hdl32e.DATA_DTYPE)
-        valid = hdl32e.is_data(packets)
-        if len(packets) and not valid.any():
-            hdl32e.check_data(lidar[0], str(self.path))
-        refuse_other_models(packets[valid], str(self.path))
+        self.lidar = recognised(sensors.of_topic(records.LIDAR.topic), packets, str(self.path)) if lidar else None
         return head
 
     def events(self) -> Iterator[Event]:

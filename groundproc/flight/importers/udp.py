@@ -10,7 +10,6 @@ from groundproc.flight.importers.pcap import Packet
 _NULL, _ETHERNET, _RAW, _LOOP, _SLL, _IPV4, _SLL2 = 0, 1, 101, 108, 113, 228, 276
 _RAW_TOO: Final = (12, 14)
 """What some systems write for raw IP."""
-LINKS: Final = (_NULL, _ETHERNET, _RAW, *_RAW_TOO, _LOOP, _SLL, _IPV4, _SLL2)
 _ETHERTYPE_IPV4: Final = 0x0800
 _VLAN: Final = (0x8100, 0x88A8, 0x9100)
 _UDP: Final = 17

@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.constants import NS_PER_S
+from groundproc.numerics import robust
 
 _FEWEST: Final = 5
 _CLIP: Final = 4.0
-_MAD_TO_SIGMA: Final = 1.4826
 
 
 def drift(pairs: npt.NDArray[np.int64], jumps: Sequence[int]) -> dict[str, Any] | None:
@@ -41,7 +41,7 @@ def drift(pairs: npt.NDArray[np.int64], jumps: Sequence[int]) -> dict[str, Any] 
     slope, level = np.polyfit(time_s, late_s, 1)
     for _ in range(3):
         residual = late_s - slope * time_s - level
-        sigma = _MAD_TO_SIGMA * np.median(np.abs(residual[keep] - np.median(residual[keep]))) + 1e-9
+        sigma = robust.sigma(residual[keep]) + 1e-9
         keep = np.abs(residual - np.median(residual)) <= _CLIP * sigma
         if np.count_nonzero(keep) < _FEWEST:
             return None

@@ -11,13 +11,14 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flightlog import hdl32e
 from flightlog.constants import NS_PER_S
-from flightlog.hdl32e import AZIMUTH_STEPS, FIRING_NS, LASER_NS, LASERS, ReturnMode
 from flightlog.records import LidarAccount
 from groundproc.flight.load import LidarBatch
 from groundproc.flight.summary.clockfit import drift
+from groundproc.sensors.model import Digest, Lidar
 
+AZIMUTH_STEPS: Final = 36_000
+"""Of 0.01 deg in a turn."""
 _COVERED: Final = 50
 """Azimuth counts as covered in pieces of this width [0.01 deg]."""
 _EDGE: Final = 10
@@ -29,21 +30,18 @@ _USUAL: Final = 0.2
 """Steps of azimuth further off the median than this are no steps between neighbours."""
 _LARGEST_GAP: Final = 20_000
 """Packets of a gap that are looked at one by one."""
-_MODES: Final = {
-    ReturnMode.UNKNOWN: "unknown",
-    ReturnMode.STRONGEST: "strongest",
-    ReturnMode.LAST: "last",
-    ReturnMode.DUAL: "dual",
-}
 
 
 @dataclass(slots=True)
 class LidarSummary:
     """Sums over all batches; `result` turns them into figures."""
 
+    model: Lidar
     packets: int = 0
     shots_with_return: int = 0
     modes: dict[int, int] = field(default_factory=dict)
+    packet_ns: dict[int, int] = field(default_factory=dict)
+    """Nominal time from packet to packet [ns] in each mode."""
     accounts: int = 0
     totals: dict[str, int] = field(default_factory=dict)
     window: tuple[int, int] | None = None
@@ -71,13 +69,15 @@ class LidarSummary:
             self.jumps.append(len(self.clock))
         if not len(batch.packets):
             return
-        data = batch.packets["data"]
-        self.packets += len(data)
-        self.shots_with_return += int(np.count_nonzero(data["blocks"]["returns"]["range"]))
-        for mode, count in zip(*np.unique(data["return_mode"], return_counts=True), strict=True):
-            self.modes[int(mode)] = self.modes.get(int(mode), 0) + int(count)
-        self.seen[data["blocks"]["azimuth"].ravel() % AZIMUTH_STEPS] = True
-        self._steps(data, batch.device_time_ns)
+        digest = self.model.digest(batch.packets)
+        self.packets += len(batch.packets)
+        self.shots_with_return += digest.returns
+        modes, first, counts = np.unique(digest.mode, return_index=True, return_counts=True)
+        for mode, at, count in zip(modes.tolist(), first.tolist(), counts.tolist(), strict=True):
+            self.modes[mode] = self.modes.get(mode, 0) + count
+            self.packet_ns[mode] = int(digest.record_ns[at])
+        self.seen[digest.azimuth_cdeg.ravel()] = True
+        self._steps(digest, batch.device_time_ns)
         late_ns = batch.receive_time_ns - batch.device_time_ns
         earliest = int(np.argmin(late_ns))
         self.clock.append((int(batch.device_time_ns[earliest]), int(late_ns[earliest])))
@@ -91,16 +91,16 @@ class LidarSummary:
         if start != end:
             self.window = (start, end)
 
-    def _steps(self, data: npt.NDArray[np.void], device_ns: npt.NDArray[np.int64]) -> None:
+    def _steps(self, digest: Digest, device_ns: npt.NDArray[np.int64]) -> None:
         """Rate of turn and gaps between neighbouring packets, the last of the batch before included."""
-        azimuth = data["blocks"]["azimuth"][:, 0].astype(np.int64) % AZIMUTH_STEPS
+        azimuth = digest.azimuth_cdeg[:, 0]
         if self._last is not None:
             azimuth = np.concatenate([[self._last[0]], azimuth])
             device_ns = np.concatenate([[self._last[1]], device_ns])
         self._last = int(azimuth[-1]), int(device_ns[-1])
         passed_ns = np.diff(device_ns)
         self.out_of_order += int((passed_ns <= 0).sum())
-        packet_ns = hdl32e.packet_ns(int(data["return_mode"][0]))
+        packet_ns = int(digest.record_ns[0])
         missing = np.rint(passed_ns / packet_ns).astype(np.int64) - 1
         neighbours = missing == 0
         turned = (np.diff(azimuth) % AZIMUTH_STEPS)[neighbours]
@@ -123,9 +123,10 @@ class LidarSummary:
         turns = self.turned / AZIMUTH_STEPS
         sensor_off = self._empty_sector() if turns >= _FEWEST_TURNS else None
         gaps = np.concatenate([np.empty((0, 4)), *self.missing])
-        missing, aboard, sensor = _reasons(gaps, self.window, sensor_off, self._packet_ns())
+        missing, aboard, sensor = _reasons(gaps, self.window, sensor_off, self._packet_ns(), self.model.idle_ns)
         rates = np.array(self.rates_rpm)
         return {
+            "model": self.model.name,
             "packets": self.packets,
             "shots_with_return": self.shots_with_return,
             "return_mode": self._mode(),
@@ -145,11 +146,11 @@ class LidarSummary:
         }
 
     def _mode(self) -> str | None:
-        names = [_MODES[ReturnMode(mode)] for mode, _ in sorted(self.modes.items(), key=lambda item: -item[1])]
+        names = [self.model.mode_names[mode] for mode, _ in sorted(self.modes.items(), key=lambda item: -item[1])]
         return " and ".join(names) if names else None
 
     def _packet_ns(self) -> int:
-        return hdl32e.packet_ns(max(self.modes, key=lambda mode: self.modes[mode], default=0))
+        return self.packet_ns[max(self.modes, key=lambda mode: self.modes[mode])] if self.modes else 1
 
     def _empty_sector(self) -> tuple[int, int] | None:
         """Widest sector (start, end) [0.01 deg] that no block ever looked into, inside the window applied aboard."""
@@ -171,12 +172,13 @@ def _reasons(
     window: tuple[int, int] | None,
     sensor_off: tuple[int, int] | None,
     packet_ns: int,
+    idle_ns: int,
 ) -> tuple[int, int, int]:
     """Of all gaps: packets missing, those that lay outside the window aboard, those that the sensor never sent."""
     total = aboard = sensor = 0
     for before, count, step, passed_ns in gaps:
         missing = int(count)
-        outside = _outside(before, missing, step, window, packet_ns)
+        outside = _outside(before, missing, step, window, idle_ns / packet_ns)
         unsent = 0
         if sensor_off is not None:
             # the sensor fills a packet on the far side of its gap: time, not place, says how many it did not send
@@ -187,14 +189,13 @@ def _reasons(
     return total, aboard, sensor
 
 
-def _outside(before: float, missing: int, step: float, window: tuple[int, int] | None, packet_ns: int) -> int:
-    """How many of the packets after the one at azimuth `before` lie wholly outside the window aboard."""
+def _outside(before: float, missing: int, step: float, window: tuple[int, int] | None, idle: float) -> int:
+    """How many of the packets after the one at azimuth `before` lie wholly outside the window aboard; `idle`: without shots at its end."""
     if window is None:
         return 0
     looked_at = min(missing, _LARGEST_GAP)
     first = before + step * np.arange(1, looked_at + 1)
-    idle_ns = FIRING_NS - (LASERS - 1) * LASER_NS
-    last_shot = step * (1 - idle_ns / packet_ns)
+    last_shot = step * (1 - idle)
     start, end = window
     dark = (start - end) % AZIMUTH_STEPS
     past = (first - end + _EDGE) % AZIMUTH_STEPS

@@ -6,15 +6,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flightlog import clock, hdl32e, records
+from flightlog import clock, records
 from flightlog.constants import NS_PER_S
-from flightlog.errors import LogError
+from flightlog.errors import LogError, WrongSensorError
 from flightlog.logfile import LogReader, Message
 from flightlog.mavlink import FrameParser
+from groundproc import sensors
+from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import BatchJoiner, DeviceClock, PositionBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
 from groundproc.flight.summary.position import PositionSummary
 from groundproc.flight.summary.telemetry import TelemetrySummary
+from groundproc.sensors import velodyne
+from groundproc.sensors.model import Lidar
 
 GAP_NS: Final = NS_PER_S
 """A silence longer than this is told."""
@@ -33,10 +37,17 @@ class _Topic:
 
 @dataclass(slots=True)
 class LogSummary:
-    """Accumulates a log message by message."""
+    """Accumulates a log message by message.
 
+    Attributes
+    ----------
+    model : Lidar
+        Of its lidar.
+    """
+
+    model: Lidar
     topics: dict[str, _Topic] = field(default_factory=dict)
-    lidar: LidarSummary = field(default_factory=LidarSummary)
+    lidar: LidarSummary = field(init=False)
     position: PositionSummary = field(default_factory=PositionSummary)
     links: dict[str, tuple[FrameParser, TelemetrySummary]] = field(default_factory=dict)
     gaps: list[dict[str, Any]] = field(default_factory=list)
@@ -46,8 +57,12 @@ class LogSummary:
     damaged: int = 0
     """Messages that are not what their topic says."""
     clock_steps: int = 0
-    _batches: BatchJoiner = field(default_factory=lambda: BatchJoiner(DeviceClock()))
+    _batches: BatchJoiner = field(init=False)
     _position_clock: DeviceClock = field(default_factory=DeviceClock)
+
+    def __post_init__(self) -> None:
+        self.lidar = LidarSummary(self.model)
+        self._batches = BatchJoiner(self.model, DeviceClock())
 
     def add(self, message: Message) -> None:
         """Take the next message."""
@@ -64,11 +79,11 @@ class LogSummary:
             self.damaged += 1
 
     def _records(self, message: Message, topic: _Topic) -> None:
-        if message.topic in BatchJoiner.TOPICS:
+        if message.topic in self._batches.topics:
             for batch in self._batches.feed(message):
                 self.lidar.add(batch)
-            if message.topic == records.LIDAR.topic:
-                self._gap(message.topic, topic, records.receive_time_ns(records.decode_scan(message.data)))
+            if message.topic == self.model.topic:
+                self._gap(message.topic, topic, self.model.receive_time_ns(self.model.unpack(message.data)))
         elif message.topic == records.POSITION.topic:
             self._position(message, topic)
         elif message.topic.startswith(records.MAVLINK.topic):
@@ -84,12 +99,12 @@ class LogSummary:
 
     def _position(self, message: Message, topic: _Topic) -> None:
         receive_ns, packets = records.decode_position(message.data)
-        good = hdl32e.is_position(packets)
+        good = velodyne.is_position(packets)
         receive_ns, packets = receive_ns[good], packets[good]
         self._gap(message.topic, topic, receive_ns)
         if len(packets):
             device_ns, _ = self._position_clock.extend(packets["stamp_us"], receive_ns)
-            self.position.add(PositionBatch(packets, receive_ns, device_ns))
+            self.position.add(PositionBatch(velodyne.readings(packets), receive_ns, device_ns))
 
     def _gap(self, name: str, topic: _Topic, received_ns: npt.NDArray[np.int64]) -> None:
         """Note the silences ahead of and between packets."""
@@ -116,7 +131,7 @@ class LogSummary:
         """The figures of the messages; see `swath info --json`."""
         return {
             "topics": {name: _topic(topic) for name, topic in sorted(self.topics.items())},
-            "lidar": self.lidar.result() if self._seen(*BatchJoiner.TOPICS) else None,
+            "lidar": self.lidar.result() if self._seen(*self._batches.topics) else None,
             "position": self.position.result() if self._seen(records.POSITION.topic) else None,
             "mavlink": {
                 link: telemetry.result(parser.bad_bytes, parser.unknown)
@@ -157,7 +172,11 @@ def summarise(reader: LogReader, progress: Progress | None = None) -> dict[str, 
     dict
         JSON-ready; keys are stable.
     """
-    summary = LogSummary()
+    try:
+        model = lidar_of([reader])
+    except WrongSensorError:  # what else the log holds is worth telling all the same
+        model = sensors.lidar(sensors.FLOWN)
+    summary = LogSummary(model)
     for message in reader.messages(progress=progress):
         summary.add(message)
     summary.finish()

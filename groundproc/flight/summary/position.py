@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flightlog import clock, hdl32e, nmea
+from flightlog import clock, nmea
 from flightlog.constants import NS_PER_S
 from flightlog.hdl32e import PpsState
 from groundproc.flight.load import PositionBatch, Sentence, new_sentences
@@ -35,12 +35,12 @@ class PositionSummary:
 
     def add(self, batch: PositionBatch) -> None:
         """Take the next batch."""
-        self.packets += len(batch.packets)
-        self.with_imu += int(hdl32e.has_imu(batch.packets).sum())
+        self.packets += len(batch)
+        self.with_imu += int(batch.readings.has_imu.sum())
         if self.first_ns is None:
             self.first_ns = int(batch.device_time_ns[0])
         self.last_ns = int(batch.device_time_ns[-1])
-        for state, count in zip(*np.unique(batch.packets["pps"], return_counts=True), strict=True):
+        for state, count in zip(*np.unique(batch.readings.pps, return_counts=True), strict=True):
             self.pps[int(state)] = self.pps.get(int(state), 0) + int(count)
         first_of_all = not self.sentences
         for sentence in new_sentences(batch, self._text):

@@ -57,6 +57,7 @@ def _log(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _lidar(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     lidar = summary["lidar"]
+    yield "model", lidar["model"]
     yield "packets", f"{lidar['packets']}, {lidar['shots_with_return']} shots with a return"
     yield "return mode", str(lidar["return_mode"] or "unknown")
     if lidar["rpm"] is not None:

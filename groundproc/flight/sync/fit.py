@@ -15,6 +15,7 @@ from flightlog.frames import mat_from_quat, quat_exp
 from groundproc.flight.sync.correlation import Peak
 from groundproc.flight.sync.result import Sync
 from groundproc.flight.sync.tracks import GyroTrack, low_pass
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 
@@ -119,7 +120,7 @@ def _weights(residual: Array, moved: Array) -> tuple[Array, Array]:
     A sample whose stamp is off is wrong by its slope times that: the variance is that of the axis plus the square of the stamp's
     jitter times the square of the slope, both learnt from the residuals. An outlier adds to the loss but not to its curvature.
     """
-    axis = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-6) ** 2
+    axis = np.maximum(robust.sigma_of_columns(residual, 0.0), 1e-6) ** 2
     variance = np.broadcast_to(axis, residual.shape)
     for _ in range(3):
         square = np.minimum(residual**2, 25.0 * variance).ravel()
@@ -133,7 +134,7 @@ def _weights(residual: Array, moved: Array) -> tuple[Array, Array]:
         variance = level[:3] + level[3] * moved**2
     normed = np.abs(residual) / np.sqrt(variance)
     inlier = normed <= HUBER
-    return np.where(inlier, 1.0, HUBER / np.maximum(normed, HUBER)) / variance, inlier / variance
+    return robust.huber(normed, HUBER) / variance, inlier / variance
 
 
 def _covariance(time_s: Array, scores: Array, normal: Array) -> Array:

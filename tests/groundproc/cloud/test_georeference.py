@@ -16,8 +16,8 @@ from flightlog.mount import LidarMount, Mount
 from groundproc.cloud.georeference import georeference, project
 from groundproc.cloud.points import Dropped
 from groundproc.geodesy import LocalFrame, Projection, projected_crs
-from groundproc.sensors import hdl32e as decode
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors import hdl32e as model
+from groundproc.sensors.shots import Gate, Shots
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -42,6 +42,12 @@ def quat_wxyz(heading: float, pitch: float, roll: float) -> Array:
     """Attitude as scipy composes it: turned left by minus the heading, then nose up, then right side down."""
     x, y, z, w = Rotation.from_euler("ZXY", [-heading, pitch, roll]).as_quat()
     return np.array([w, x, y, z])
+
+
+def decoded(packets: npt.NDArray[np.void], times: npt.NDArray[np.int64], gate: Gate | None = None) -> Shots:
+    """Packets of one return mode as shots."""
+    (shots,) = model.LIDAR.decode(packets, times, gate)
+    return shots
 
 
 def at_rest(position: Array, quat: Array, start_ns: int = START_NS, seconds: int = 2) -> Trajectory:
@@ -95,19 +101,22 @@ def test_every_point_is_where_the_sources_equation_puts_it(
     times = START_NS + np.array([0, 552_960], np.int64)
     yaw_deg, pitch_deg, roll_deg = np.rad2deg(mount)
     bolted = Mount(LidarMount(lever, float(yaw_deg), float(pitch_deg), float(roll_deg)))
-    points = georeference(packets, times, at_rest(np.array(position), quat_wxyz(*attitude)), bolted)
-    shots = decode.decode(packets, times)
+    points = georeference(decoded(packets, times), at_rest(np.array(position), quat_wxyz(*attitude)), bolted)
+    shots = decoded(packets, times)
     # step 2: p2 = p1 R(mount) + lever arm; step 3: p3 = p2 R(-heading, pitch, roll) + position
     heading, pitch, roll = attitude
     on_airframe = sensor_xyz(packets, times, shots) @ by_the_source(*mount) + np.array(lever)
     expected = on_airframe @ by_the_source(-heading, pitch, roll) + np.array(position)
-    np.testing.assert_allclose(points.xyz_m, expected, atol=1e-6)
+    np.testing.assert_allclose(points.xyz_m, expected, atol=2e-5)  # xyz_m as float32: 4e-6 m an axis at 100 m
     assert (points.time_ns == shots.time_ns).all()
-    for name in ("range_steps", "intensity", "laser", "returns"):
-        assert (getattr(points, name) == getattr(shots, name)).all()
+    for name in ("intensity", "laser"):
+        assert (points[name] == getattr(shots, name)).all()
+    assert (points["range"] == shots.range_m).all()
+    assert (points["return_number"] == shots.returns & 15).all()
+    assert (points["number_of_returns"] == shots.returns >> 4).all()
 
 
-def sensor_xyz(packets: npt.NDArray[np.void], times: npt.NDArray[np.int64], shots: decode.Shots) -> Array:
+def sensor_xyz(packets: npt.NDArray[np.void], times: npt.NDArray[np.int64], shots: Shots) -> Array:
     """Step 1 in float64 from the packets' bytes: where the rotor stood when each laser fired (manual, appendix on firing times).
 
     Of the shots only time, laser and range are taken. A firing lasts 46.08 us, the lasers of it follow each other every 1.152 us, and
@@ -125,7 +134,7 @@ def sensor_xyz(packets: npt.NDArray[np.void], times: npt.NDArray[np.int64], shot
         turned = steps[len(steps) // 2] * (1.152 / 46.08) * shots.laser[mine]
         azimuth_deg[mine] = (np.array(blocks)[firing] + turned) / 100.0
     azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(hdl32e.ELEVATION_DEG)[shots.laser]
-    reach_m = shots.range_steps * 0.002
+    reach_m = shots.range_m.astype(np.float64)
     across = np.stack(
         [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=1
     )
@@ -150,7 +159,9 @@ def test_level_ground_is_level_in_every_attitude(heading_deg: float, pitch_deg: 
     reach_m = np.where(down < -0.15, -(10.0 + lidar_up_m) / np.minimum(down, -0.15), 0.0)
     packets["blocks"]["returns"]["range"] = np.rint(reach_m / 0.002).reshape(163, 12, 32)
     attitude = quat_wxyz(*np.deg2rad([heading_deg, pitch_deg, roll_deg]))
-    points = georeference(packets, np.full(163, START_NS), at_rest(np.array([3.0, 4.0, 110.0]), attitude), Mount())
+    points = georeference(
+        decoded(packets, np.full(163, START_NS)), at_rest(np.array([3.0, 4.0, 110.0]), attitude), Mount()
+    )
     assert len(points) > 10_000
     # half a range step, and the difference between the median step (18 or 19) and 18.4 over a firing, under 67 m of range
     np.testing.assert_allclose(points.xyz_m[:, 2], 100.0, atol=0.001 + np.deg2rad(0.006) * 67.0)
@@ -159,8 +170,8 @@ def test_level_ground_is_level_in_every_attitude(heading_deg: float, pitch_deg: 
     assert ahead.mean() > 1.0 or pitch_deg > 0
 
 
-def test_each_firing_has_the_pose_of_its_own_middle() -> None:
-    """Spinning at 100 deg/s and flying at 10 m/s, against scipy's slerp at the middle of each firing."""
+def test_each_shot_has_the_pose_of_its_own_instant() -> None:
+    """Spinning at 100 deg/s and flying at 10 m/s, against scipy's slerp at the instant of each shot."""
     packets = turning(60)
     times = START_NS + np.arange(60, dtype=np.int64) * 552_960
     knots = START_NS + np.arange(-10, 10, dtype=np.int64) * 10_000_000
@@ -175,23 +186,33 @@ def test_each_firing_has_the_pose_of_its_own_middle() -> None:
         FRAME, knots, seconds[:, None] * speed, np.tile(speed, (len(knots), 1)), quat, np.tile(spin, (len(knots), 1)),
         np.zeros(many), np.zeros(many), np.append(np.ones(len(knots) - 1, bool), False),
     )  # fmt: skip
-    points = georeference(packets, times, trajectory, Mount())
-    shots = decode.decode(packets, times)
-    firing = (shots.time_ns - START_NS) // 46_080
-    middle_s = (firing * 46_080 + 17_856) * 1e-9
+    points = georeference(decoded(packets, times), trajectory, Mount())
+    shots = decoded(packets, times)
+    own_s = (shots.time_ns - START_NS) * 1e-9
     tilt = Rotation.from_euler("X", -20.0, degrees=True)
     on_airframe = tilt.apply(sensor_xyz(packets, times, shots)) + np.array([0.0, 0.0, -0.16])
-    expected = (base * Rotation.from_rotvec(middle_s[:, None] * spin)).apply(on_airframe) + middle_s[:, None] * speed
-    np.testing.assert_allclose(points.xyz_m, expected, atol=2e-6)
-    # and that is what the docstring says of a pose of every shot's own instant: 50 deg/s at 50 m is 0.8 mm
-    own_s = (shots.time_ns - START_NS) * 1e-9
-    exact = (base * Rotation.from_rotvec(own_s[:, None] * spin)).apply(on_airframe) + own_s[:, None] * speed
-    limit = (
-        0.8e-3 * (np.linalg.norm(spin) / np.deg2rad(50)) * (shots.range_steps * 0.002 / 50)
-        + 17.9e-6 * np.linalg.norm(speed)
-        + 1e-5
-    )
-    assert (np.linalg.norm(points.xyz_m - exact, axis=1) <= limit).all()
+    expected = (base * Rotation.from_rotvec(own_s[:, None] * spin)).apply(on_airframe) + own_s[:, None] * speed
+    # chord of 0.5 ms at 100 deg/s: (8.7e-4 rad)^2 / 8 of 100 m is 1e-5 m; xyz_m as float32: 8e-6 m; the trajectory's spline: 2e-6 m
+    np.testing.assert_allclose(points.xyz_m, expected, atol=2e-5)
+
+
+def test_a_held_pose_grid_gives_each_shot_the_nearest_pose() -> None:
+    packets = turning(60)
+    times = START_NS + np.arange(60, dtype=np.int64) * 552_960
+    resting = at_rest(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    knots = START_NS + np.arange(-5, 10, dtype=np.int64) * 10_000_000
+    many = len(knots)
+    zero = np.zeros((many, 3))
+    where = np.stack([np.arange(many) * 1.0, np.zeros(many), np.zeros(many)], axis=1)
+    held = Trajectory(
+        FRAME, knots, where, zero, np.tile([1.0, 0, 0, 0], (many, 1)), zero, zero, zero,
+        np.append(np.ones(many - 1, bool), False), interpolation="hold",
+    )  # fmt: skip
+    shots = decoded(packets, times)
+    moved = georeference(shots, held, Mount()).xyz_m - georeference(shots, resting, Mount()).xyz_m
+    late = shots.time_ns - knots[0]
+    nearest = -(-(late - 5_000_000) // 10_000_000)  # halfway between two poses the earlier one holds
+    np.testing.assert_allclose(moved[:, 0], nearest, atol=1e-5)
 
 
 def test_what_makes_no_point_is_counted_by_its_first_reason() -> None:
@@ -199,21 +220,21 @@ def test_what_makes_no_point_is_counted_by_its_first_reason() -> None:
     times = START_NS + np.arange(400, dtype=np.int64) * 552_960
     whole = at_rest(np.zeros(3), np.array([1.0, 0, 0, 0]))
     gate = Gate(255.0, 105.0, 5.0, 60.0)
-    points = georeference(packets, times, whole, Mount(), gate)
-    shots = decode.decode(packets, times, Gate(255.0, 105.0))
+    points = georeference(decoded(packets, times, gate), whole, Mount())
+    shots = decoded(packets, times, Gate(255.0, 105.0))
     filled = packets.copy()
     filled["blocks"]["returns"]["range"] = 1
     lost = points.dropped
     assert len(points) + lost.no_pose + lost.outside_fov + lost.no_return + lost.out_of_range == 400 * 384
-    assert len(points) == ((shots.range_steps >= 2500) & (shots.range_steps <= 30_000)).sum()
+    assert len(points) == ((shots.range_m > 4.9999) & (shots.range_m < 60.0001)).sum()
     assert lost.out_of_range == len(shots) - len(points)
-    assert lost.no_return == len(decode.decode(filled, times, Gate(255.0, 105.0))) - len(shots)
+    assert lost.no_return == len(decoded(filled, times, Gate(255.0, 105.0))) - len(shots)
     assert lost.no_pose == 0
     short = at_rest(np.zeros(3), np.array([1.0, 0, 0, 0]), START_NS - 2_000_000_000 + 100 * 552_960)
-    cut = georeference(packets, times, short, Mount(), gate)
-    # the end of the trajectory falls on the stamp of packet 100, before the middle of its first firing
-    assert cut.dropped.no_pose == 300 * 384
-    assert len(cut) == np.count_nonzero(points.time_ns < times[100])
+    cut = georeference(decoded(packets, times, gate), short, Mount())
+    # the end of the trajectory falls on the stamp of packet 100, the instant of its first shot, which is covered still
+    assert len(cut) == np.count_nonzero(points.time_ns <= times[100])
+    assert cut.dropped.no_pose == len(points) - len(cut)
     assert Dropped(1, 2, 3, 4) + Dropped(10, 20, 30, 40) == Dropped(11, 22, 33, 44)
 
 
@@ -225,12 +246,14 @@ def test_two_returns_of_a_pair_lie_on_one_line_from_the_lidar(data_payload: Call
     packets = np.frombuffer(bytes(payload), hdl32e.DATA_DTYPE)
     where = np.array([10.0, 20.0, 30.0])
     quat = quat_wxyz(1.0, 0.2, -0.1)
-    points = georeference(packets, np.array([START_NS]), at_rest(where, quat), Mount())
-    assert points.returns.tolist() == [0x21, 0x22] * 192
+    points = georeference(decoded(packets, np.array([START_NS])), at_rest(where, quat), Mount())
+    assert points["return_number"].tolist() == [1, 2] * 192
+    assert (points["number_of_returns"] == 2).all()
     lidar = where + Rotation.from_euler("ZXY", [-1.0, 0.2, -0.1]).apply([0.0, 0.0, -0.16])
     near, far = points.xyz_m[::2] - lidar, points.xyz_m[1::2] - lidar
-    np.testing.assert_allclose(far, near * 1.5, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(near, axis=1), 6.0, atol=1e-9)
+    # xyz_m as float32 at 9 m: 5e-7 m an axis
+    np.testing.assert_allclose(far, near * 1.5, atol=2e-6)
+    np.testing.assert_allclose(np.linalg.norm(near, axis=1), 6.0, atol=2e-6)
 
 
 def test_projecting_in_place_is_what_the_polynomial_says() -> None:

@@ -28,12 +28,13 @@ from groundproc.estimation.calibration.compass import (
 from groundproc.estimation.dynamic import ground_model, plan
 from groundproc.estimation.dynamic.course import Course, compare
 from groundproc.estimation.dynamic.ground_model import Raster
-from groundproc.estimation.dynamic.options import DynamicOptions, StepOptions
 from groundproc.estimation.dynamic.plan import DistanceMap
 from groundproc.estimation.dynamic.revolutions import Revolution
 from groundproc.estimation.dynamic.search import VARIABLES, Found, Search
-from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw, write_trims
+from groundproc.estimation.dynamic.trims import Trims, applied, interpolated, read_yaw
 from groundproc.geodesy import LocalFrame
+from groundproc.products.trim_table import write_trims
+from groundproc.survey.dynamic import DynamicOptions, StepOptions
 from groundproc.trajectory.table import from_poses
 
 Array = npt.NDArray[np.float64]
@@ -392,7 +393,7 @@ def test_trims_are_read_as_they_were_written(tmp_path: Path) -> None:
         for t, h, v in zip(time_ns, heading, values, strict=True)
     ]
     path = tmp_path / "trims.csv"
-    write_trims(path, Trims(time_ns, heading, values, np.full(5, np.nan), found))
+    write_trims(path, Trims(time_ns, heading, values, np.full(5, np.nan), found).figures())
     stamps, compass, yaw = read_yaw(path)
     np.testing.assert_array_equal(stamps, time_ns)
     np.testing.assert_allclose(compass, heading, atol=1e-5)

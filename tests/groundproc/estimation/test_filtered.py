@@ -17,11 +17,11 @@ from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame
 from flightlog.mount import Mount
-from groundproc.estimation import filtered, ins, methods
+from groundproc.estimation import direct, filtered, ins, methods
 from groundproc.estimation.inertial import readings
-from groundproc.estimation.inertial.model import ATTITUDE, GYRO_BIAS, POSITION
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.method import Given, gather
+from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, POSITION
 from groundproc.flight import autopilot
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight
@@ -113,7 +113,7 @@ class Flown:
 
 def fly(simulated: Any, change: Callable[[Flight], None] | None = None) -> Flown:
     with given_of(simulated.log, change) as given:
-        raw = methods.ins_estimate(given, quiet).trajectory
+        raw = direct.ins_estimate(given, quiet).trajectory
         estimate = filtered.filtered_estimate(given, quiet)
         solution = filtered.solve_leg(given, given.placed[0], given.fixes[0])
     assert estimate.warning == ""
@@ -168,6 +168,36 @@ def test_what_is_stated_covers_the_errors(ordinary: list[Flown]) -> None:
     for error, sigma in (("position", "sigma_position"), ("attitude", "sigma_attitude")):
         within = [np.abs(getattr(f.filtered, error)) < 2.0 * getattr(f.filtered, sigma) for f in ordinary]
         assert np.mean(within) > 0.95
+
+
+def test_the_covariance_of_roll_pitch_and_heading_is_that_of_turned_attitudes(ordinary: list[Flown]) -> None:
+    """Against 100 000 errors drawn from the smoother's covariance, by which an attitude is really turned; right to 1/316 each."""
+    flown = ordinary[0]
+    solution = flown.solution
+    at = len(solution.kept_ns) // 2
+    states = [*range(POSITION, POSITION + 3), *range(ATTITUDE, ATTITUDE + 3)]
+    own = solution.covariance[at].astype(np.float64)[np.ix_(states, states)]
+    # of this size a turn changes angles linearly
+    drawn = np.random.default_rng(6).multivariate_normal(np.zeros(6), 1e-4 * own, 100_000)
+    quat = solution.quat[np.searchsorted(solution.time_ns, solution.kept_ns[at])]
+    mat = frames.mat_from_quat(quat[None])
+    before = np.array(frames.attitude_of(mat)).ravel()
+    after = np.stack(frames.attitude_of(frames.mat_from_quat(frames.quat_exp(drawn[:, 3:])) @ mat), axis=1)
+    angles = ((after - before + np.pi) % (2 * np.pi) - np.pi)[:, [2, 1, 0]]
+    wanted = np.cov(np.hstack([drawn[:, :3], angles]).T) * 1e4
+    trajectory = filtered.trajectory_in(solution_frame(flown), solution)
+    found = trajectory.covariance_at(solution.kept_ns[[at]])[0]
+    sigma = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(found / np.outer(sigma, sigma), wanted / np.outer(sigma, sigma), atol=5 / 316)
+
+
+def test_sigmas_are_the_roots_of_the_covariances_diagonals(ordinary: list[Flown]) -> None:
+    for flown in ordinary:
+        trajectory = filtered.trajectory_in(solution_frame(flown), flown.solution)
+        covariance = trajectory.covariance_at(trajectory.time_ns)
+        sigma = np.hstack([trajectory.sigma_position_m, trajectory.sigma_attitude_rad])
+        np.testing.assert_allclose(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), sigma, rtol=1e-12)
+        assert np.linalg.eigvalsh(trajectory.correlation.matrix).min() > -1e-6  # the smoother keeps single precision
 
 
 def test_errors_are_those_that_the_covariance_allows(ordinary: list[Flown]) -> None:

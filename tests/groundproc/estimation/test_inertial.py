@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from groundproc.estimation.inertial import imu, kalman
 from groundproc.estimation.inertial.imu import Samples
-from groundproc.estimation.inertial.model import (
+from groundproc.estimation.inertial.readings import normal_gravity, pressure_height
+from groundproc.estimation.inertial.transition import Motion, backward_rows, forward_rows
+from groundproc.estimation.observations.states import (
     ATTITUDE,
     FIX_POSITION,
     FIX_VELOCITY,
@@ -23,7 +25,6 @@ from groundproc.estimation.inertial.model import (
     Model,
     start_covariance,
 )
-from groundproc.estimation.inertial.readings import normal_gravity, pressure_height
 
 Array = npt.NDArray[np.float64]
 NODES, STEP_S, GRAVITY = 25, 0.05, 9.81
@@ -108,10 +109,9 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
         for name in ("_forward", "_record", "_back"):
             monkeypatch.setattr(kalman, name, getattr(kalman, name).py_func)
     keep = np.tile(KEEP, (NODES - 1, 1))
-    smooth(
-        reference, (np.full(NODES - 1, STEP_S), angle, push, *densities), GRAVITY, keep, drive, first, rows, start, covariance, 1,
-        correction, residual, kept, kept_covariance, variance,
-    )  # fmt: skip
+    motion = Motion(*reference, np.full(NODES - 1, STEP_S), angle, push, *densities, GRAVITY, keep, drive)
+    out = kalman.Smoothed(1, correction, residual, kept, kept_covariance, variance)
+    smooth(motion, kalman.Rows(first, *rows), start, covariance, out)
     # all states of all nodes as one Gaussian vector, conditioned on all measurements at once
     noise = drive * STEP_S
     noise[3:6], noise[6:9] = densities[1][0] * STEP_S, densities[0][0] * STEP_S
@@ -147,8 +147,8 @@ def test_forward_and_backward_transitions_are_each_others_transposes() -> None:
     rng = np.random.default_rng(0)
     couple, keep = rng.standard_normal((5, 3)), rng.uniform(0.5, 1.0, 5)
     forward, backward = np.eye(STATES), np.eye(STATES)
-    kalman._forward_rows(forward, 0.3, couple, keep)
-    kalman._backward_rows(backward, 0.3, couple, keep)
+    forward_rows(forward, 0.3, couple, keep)
+    backward_rows(backward, 0.3, couple, keep)
     np.testing.assert_allclose(backward, forward.T, atol=1e-14)
 
 

@@ -11,6 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 from flightlog import records
 from flightlog.logfile import LogReader
 from groundproc.cli import main
+from groundproc.flight.lidar import lidar_of
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -148,24 +149,41 @@ def test_a_capture_cut_at_any_byte_gives_a_log_of_what_is_whole_or_one_sentence(
             assert len(chunks(log, records.POSITION.topic)) == whole - 1
 
 
-def test_a_vlp16_is_refused_by_name(recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, said = run(capsys, "--pcap", recordings / "lidar/vlp16_gps.pcap", "-o", tmp_path / "v.mcap")
-    assert code == 1
-    assert "VLP-16" in said
-    assert "HDL-32E" in said
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_vlp16_that_calls_itself_an_hdl32e_is_refused_by_its_timing(
-    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("product", [b"\x22", b"\x21"])
+def test_a_vlp16_is_imported_as_one_even_where_it_calls_itself_an_hdl32e(
+    product: bytes, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = (recordings / "lidar/vlp16_gps.pcap").read_bytes()
-    disguised = tmp_path / "v.pcap"
-    disguised.write_bytes(content.replace(b"\x37\x22", b"\x37\x21"))
-    code, said = run(capsys, "--pcap", disguised, "-o", tmp_path / "v.mcap")
+    capture = tmp_path / "v.pcap"
+    capture.write_bytes(content.replace(b"\x37\x22", b"\x37" + product))
+    code, _ = run(capsys, "--pcap", capture, "-o", tmp_path / "v.mcap")
+    assert code == 0
+    with LogReader(tmp_path / "v.mcap") as reader:
+        assert reader.metadata["swath.session"]["lidar"] == "VLP-16"
+        assert lidar_of([reader]).name == "VLP-16"
+
+
+def test_another_sensor_is_refused_by_name(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = tmp_path / "v.pcap"
+    capture.write_bytes((recordings / "lidar/vlp16_gps.pcap").read_bytes().replace(b"\x37\x22", b"\x37\x28"))
+    code, said = run(capsys, "--pcap", capture, "-o", tmp_path / "v.mcap")
     assert code == 1
-    assert "is a VLP-16" in said
-    assert list(tmp_path.iterdir()) == [disguised]
+    assert "is a VLP-32C" in said
+    assert "HDL-32E" in said
+    assert "VLP-16" in said
+    assert list(tmp_path.iterdir()) == [capture]
+
+
+def test_captures_of_two_models_are_not_one_flight(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    captures = [recordings / "lidar" / name for name in ("vlp16_gps.pcap", "hdl32e_monterey.pcap")]
+    code, said = run(capsys, "--pcap", *captures, "-o", tmp_path / "v.mcap")
+    assert code == 1
+    assert "one flight has one lidar" in said
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("dual", [False, True])

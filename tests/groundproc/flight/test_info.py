@@ -248,7 +248,7 @@ def test_the_keys_of_the_json_are_these(monterey_log: Path) -> None:
     ]  # fmt: skip
     assert sorted(summary["lidar"]) == [
         "account", "azimuth_coverage_deg", "clock", "lost_packets", "missing_outside_sensor_fov",
-        "missing_outside_window_aboard", "missing_packets", "out_of_order", "packets", "return_mode", "rpm", "rpm_spread",
+        "missing_outside_window_aboard", "missing_packets", "model", "out_of_order", "packets", "return_mode", "rpm", "rpm_spread",
         "sensor_fov_deg", "shots_with_return", "turns", "window_aboard_deg",
     ]  # fmt: skip
 

@@ -33,7 +33,7 @@ from groundproc.live.server import PageServer
 from groundproc.live.session import Lag, PathLine
 from groundproc.live.slicer import Slicer
 from groundproc.live.voxelcloud import VoxelCloud
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors.shots import Gate
 
 
 def until(condition: Callable[[], bool], seconds: float = 90.0) -> None:

@@ -16,13 +16,25 @@ from hypothesis import strategies as st
 
 from flightlog import hdl32e, records
 from flightlog.errors import PacketError
-from groundproc.sensors.hdl32e import Gate, LaserTable, Shots, by_mode, decode
+from groundproc.sensors import firings
+from groundproc.sensors import hdl32e as model
+from groundproc.sensors.shots import Gate, LaserTable, Shots
 
 # 63-9113 Rev A, page 10, retyped: elevation of each laser in firing order
 ELEVATIONS_DEG = [
     -30.67, -9.33, -29.33, -8.00, -28.00, -6.67, -26.67, -5.33, -25.33, -4.00, -24.00, -2.67, -22.67, -1.33, -21.33, 0.00,
     -20.00, 1.33, -18.67, 2.67, -17.33, 4.00, -16.00, 5.33, -14.67, 6.67, -13.33, 8.00, -12.00, 9.33, -10.67, 10.67,
 ]  # fmt: skip
+
+
+def decode(
+    packets: npt.NDArray[np.void],
+    time_ns: npt.NDArray[np.int64],
+    gate: Gate | None = None,
+    lasers: LaserTable | None = None,
+) -> Shots:
+    """Packets of one mode by the HDL-32E's file."""
+    return firings.decode(model.LIDAR.firing, packets, time_ns, gate, lasers or model.LIDAR.lasers)
 
 
 def payloads(capture: Path) -> list[bytes]:
@@ -91,12 +103,12 @@ def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
         np.array(column) for column in zip(*expected, strict=True)
     )
     assert (shots.time_ns == time_ns).all()
-    assert (shots.range_steps == ranges).all()
+    assert (shots.range_m == (ranges * 0.002).astype(np.float32)).all()
     assert (shots.intensity == intensity).all()
     assert (shots.laser == laser).all()
     assert (shots.returns == returns).all()
     np.testing.assert_allclose(shots.xyz_m, np.stack([x, y, z], axis=1), atol=1e-5)
-    off = (shots.azimuth_cdeg - azimuth + 18_000) % 36_000 - 18_000
+    off = (np.rad2deg(shots.azimuth_rad) * 100 - azimuth + 18_000) % 36_000 - 18_000
     assert np.abs(off).max() < 0.005  # float32 of up to 36000
 
 
@@ -122,11 +134,11 @@ def test_a_recording_decodes_as_velodyne_decoder_decodes_it(monterey: list[bytes
     # their x is forward, their y left; their vertical offset leaves the horizontal distance alone
     elevation = np.deg2rad(np.array(ELEVATIONS_DEG))[ours.laser]
     their_steps = np.hypot(theirs["x"].astype(float), theirs["y"]) / np.cos(elevation) / 0.002
-    assert np.abs(their_steps - ours.range_steps).max() < 0.05  # float32
+    assert np.abs(their_steps - ours.range_m / 0.002).max() < 0.05  # float32
     across = np.hypot(ours.xyz_m[:, 0] + theirs["y"], ours.xyz_m[:, 1] - theirs["x"])
     assert across.mean() < 0.001
     # they take the step over the packet from its ends, we its median: both know it to an encoder step of 0.01 deg
-    assert (across <= np.deg2rad(0.011) * ours.range_steps * 0.002).all()
+    assert (across <= np.deg2rad(0.011) * ours.range_m).all()
 
 
 def test_a_recording_decodes_as_the_loop_by_hand_does(monterey: list[bytes]) -> None:
@@ -184,9 +196,9 @@ def test_any_packet_decodes_as_the_loop_by_hand_does(payload: bytes, gate: Gate)
 @given(noise=st.binary(min_size=1200, max_size=1200), mode=st.sampled_from([0x37, 0x39]))
 def test_packets_of_noise_give_shots_of_finite_place(noise: bytes, mode: int) -> None:
     shots = decode(packets_of([noise + struct.pack("<IBB", 0, mode, 0x21)]), np.zeros(1, np.int64))
-    np.testing.assert_allclose(np.linalg.norm(shots.xyz_m.astype(float), axis=1), shots.range_steps * 0.002, rtol=1e-5)
-    assert ((shots.azimuth_cdeg >= 0) & (shots.azimuth_cdeg <= 36_000)).all()
-    assert (shots.range_steps > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(shots.xyz_m.astype(float), axis=1), shots.range_m, rtol=1e-5)
+    assert ((shots.azimuth_rad >= 0) & (shots.azimuth_rad <= np.float32(2 * np.pi))).all()
+    assert (shots.range_m > 0).all()
 
 
 def test_an_equal_pair_is_one_return_and_the_nearer_is_return_one(data_payload: Callable[..., bytes]) -> None:
@@ -200,7 +212,7 @@ def test_an_equal_pair_is_one_return_and_the_nearer_is_return_one(data_payload: 
     rows = list(
         zip(
             shots.laser[first].tolist(),
-            (shots.range_steps[first] * 2).tolist(),
+            np.rint(shots.range_m[first] * 1000).astype(int).tolist(),
             shots.returns[first].tolist(),
             strict=True,
         )
@@ -215,9 +227,9 @@ def test_a_batch_is_cut_where_the_return_mode_changes(data_payload: Callable[...
     modes = [0x37, 0x37, 0x39, 0x39, 0x39, 0x38]
     packets = np.zeros(len(modes), records.SCAN_PACKET_DTYPE)
     packets["data"] = packets_of([data_payload(0, [0] * 12, mode=mode) for mode in modes])
-    parts = list(by_mode(packets, np.arange(6, dtype=np.int64)))
-    assert [times.tolist() for _, times in parts] == [[0, 1], [2, 3, 4], [5]]
-    assert [len(decode(p, t)) for p, t in parts] == [2 * 384, 3 * 192, 384]
+    parts = list(model.LIDAR.decode(packets, np.arange(6, dtype=np.int64)))
+    assert [len(shots) for shots in parts] == [2 * 384, 3 * 192, 384]
+    assert [int(shots.time_ns[0]) for shots in parts] == [0, 2, 5]
     with pytest.raises(PacketError, match="single and dual return mode"):
         decode(packets, np.arange(6, dtype=np.int64))
 
@@ -234,12 +246,13 @@ def test_packets_of_a_log_and_bare_packets_give_the_same(data_payload: Callable[
 
 def test_corrections_of_a_laser_move_its_points_along_the_beam(data_payload: Callable[..., bytes]) -> None:
     packet = packets_of([data_payload(0, list(range(0, 192, 16)))])
-    nominal = LaserTable.nominal()
+    nominal = model.LIDAR.lasers
     offset = np.zeros(32)
     offset[5] = 0.25
     plain, moved = (
-        decode(packet, np.zeros(1, np.int64), lasers=t) for t in (nominal, LaserTable(nominal.elevation_rad, offset))
+        decode(packet, np.zeros(1, np.int64), lasers=t)
+        for t in (nominal, LaserTable(nominal.elevation_rad, offset, nominal.height_m))
     )
     length = np.linalg.norm(moved.xyz_m, axis=1) - np.linalg.norm(plain.xyz_m, axis=1)
     np.testing.assert_allclose(length, np.where(plain.laser == 5, 0.25, 0.0), atol=1e-5)
-    assert (moved.range_steps == plain.range_steps).all()
+    assert (moved.range_m == plain.range_m).all()

@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flightlog.errors import SwathError
-from groundproc.estimation.adjustment.factors import Unknowns
-from groundproc.estimation.adjustment.planes import TILT_PRIOR
+from groundproc.cloud.gpstime import Clock
+from groundproc.estimation.observations.rows import Unknowns
 from groundproc.geodesy import projected_crs
+from groundproc.numerics.planerows import TILT_PRIOR
 from groundproc.strips.adjust import Linear, Sigmas, constant_prior, wandering
-from groundproc.strips.clouds import Clock, chunks, look
+from groundproc.strips.clouds import chunks, look
 from groundproc.strips.clusters import CLUSTER, Gatherer
 from groundproc.strips.correction import Correction
 from groundproc.strips.cutting import BIN_NS, Occupancy

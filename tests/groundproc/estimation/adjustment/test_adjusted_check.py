@@ -3,17 +3,35 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from groundproc.estimation.adjustment.adjusted import SLID_SIGMAS, Run
+from flightlog.mount import Mount
+from groundproc.estimation.adjustment.run import Run
+from groundproc.estimation.adjustment.windows import MISALIGNMENT_RAD
+from groundproc.estimation.observations.fixes import SLID_SIGMAS, Fixes
+from groundproc.estimation.observations.lasers import UNKNOWNS
+from groundproc.sensors.lasers import LaserCorrections
+
+
+class SeenTrack:
+    """Ten seconds in which the lidar saw planes enough."""
+
+    def __init__(self, restarts: int) -> None:
+        self.restarts, self.matched = restarts, [500] * 100
+
+    def __len__(self) -> int:
+        return len(self.matched)
 
 
 def run_with(restarts: int, slid: float, outside: tuple[str, ...]) -> Run:
-    track: Any = SimpleNamespace(restarts=restarts, matched=[500] * 100)
+    track: Any = SeenTrack(restarts)
     log = [{"chi_square": 0.2, "moved_m": 0.001, "position_drift": slid, "position_rms": 0.3}]
-    windows: Any = [SimpleNamespace(log=log, control=[])]
+    windows: Any = [SimpleNamespace(log=log, told={})]
     unused: Any = None
-    sources: Any = SimpleNamespace(outside=outside, control=())
+    fixes = Fixes("fixes0", unused, 0, unused)
+    sources: Any = SimpleNamespace(observations=[fixes], leads=lambda: bool(outside))
     return Run(windows, unused, track, unused, sources)
 
 
@@ -37,3 +55,31 @@ def test_misled_is_who_lost_the_way_and_ends_away_from_the_fixes(
         said = run.warnings()
         assert any("the trajectory is what the adjustment began from" in sentence for sentence in said)
         assert any("lost its way" in sentence for sentence in said)
+
+
+@pytest.mark.parametrize("misled", [True, False])
+def test_mount_and_lasers_are_those_that_the_trajectory_was_made_with(misled: bool) -> None:
+    """Where it is the start's, what a misled adjustment thinks of the mount would only turn the cloud away from it."""
+    run = run_with(1 if misled else 0, 2 * SLID_SIGMAS, ())
+    (window,) = run.windows
+    window.values = {
+        "ins.turn": (np.array([0.01, 0.0, 0.02]), np.array([0.001, 0.002, 0.003])),
+        "ins.lever": (np.array([0.0, 0.1, 0.16]), np.array([0.004, 0.005, 0.006])),
+    }
+    window.corrections = np.full(UNKNOWNS, 0.004), 1e-8 * np.eye(UNKNOWNS)
+    given, nominal = LaserCorrections(), Mount()
+    mount, sigma = run.mount(nominal), run.mount_sigma(nominal)
+    if misled:
+        assert (mount, sigma, run.lasers(given, 32), run.mount_source("log")) == (nominal, None, given, "log")
+        return
+    assert run.mount_source("log") == "estimated by adjusted, begun from log"
+    assert run.lasers(given, 32).range_m == (0.004,) * 32
+    turned = nominal.mat_ins_lidar().T @ mount.mat_ins_lidar()
+    np.testing.assert_allclose(Rotation.from_matrix(turned).as_rotvec(), [-0.01, 0.0, -0.02], atol=1e-9)
+    np.testing.assert_allclose(mount.lidar_position_m(), -mount.mat_ins_lidar() @ [0.0, 0.1, 0.16])
+    assert sigma is not None
+    # the boresight is found through a gyro whose axes are no better known
+    np.testing.assert_allclose(sigma.turn_rad, np.hypot([0.001, 0.002, 0.003], MISALIGNMENT_RAD))
+    # the lever arm's covariance in the ins frame, by the nose-down mount
+    lever = mount.mat_ins_lidar() @ np.diag(np.square([0.004, 0.005, 0.006]) + 0.003**2) @ mount.mat_ins_lidar().T
+    np.testing.assert_allclose(sigma.position_m, np.sqrt(np.diag(lever)))

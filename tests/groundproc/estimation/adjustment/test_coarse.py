@@ -6,9 +6,9 @@ import pytest
 
 from flightlog import frames
 from groundproc.estimation.adjustment.coarse import EVERY, Coarse, Nodes, coarse_of, lidar_between
-from groundproc.estimation.adjustment.factors import Unknowns
-from groundproc.estimation.adjustment.planes import Rows, rows_of
 from groundproc.estimation.adjustment.solve import Problem, problem
+from groundproc.estimation.observations.planes import Rows, rows_of
+from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
 from tests.helpers.circling import INTERVALS, SIZE, circle, factors_of, room, unknowns_of_whole

@@ -9,9 +9,6 @@ import pytest
 
 from flightlog import frames
 from flightlog.constants import NS_PER_S
-from groundproc.estimation.adjustment import adjusted
-from groundproc.estimation.adjustment.batch import COMPASS_PRIOR, turned
-from groundproc.estimation.adjustment.factors import Factor, Unknowns, normal_equations, prior_factor
 from groundproc.estimation.adjustment.joining import (
     Joined,
     Stiffness,
@@ -22,8 +19,14 @@ from groundproc.estimation.adjustment.joining import (
     stiffness_of,
     tilt_factor,
 )
+from groundproc.estimation.adjustment.pace import Pace
 from groundproc.estimation.adjustment.patches import CHUNK, KEPT, PATCH_M, Patches, all_of, coarse, patches_of
-from groundproc.estimation.adjustment.planes import placed
+from groundproc.estimation.observations.attitudes import COMPASS_PRIOR, StatedAttitudes
+from groundproc.estimation.observations.fixes import Fixes
+from groundproc.estimation.observations.observation import Observation
+from groundproc.estimation.observations.planes import placed
+from groundproc.estimation.observations.rows import Factor, Unknowns, normal_equations, prior_factor, turned
+from groundproc.estimation.observations.source import Clock
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
@@ -123,11 +126,16 @@ def loose() -> Stiffness:
     return Stiffness(np.full((SLICES, 3), np.deg2rad(0.02) ** 2), np.full((SLICES, 3), 0.005**2), np.deg2rad(0.02))
 
 
+def stated(fixes: Positions, *attitudes: Attitudes) -> list[Observation]:
+    """What the autopilot says."""
+    return [Fixes("fixes0", fixes, 0, Clock("fixes0.delay")), StatedAttitudes(attitudes)]
+
+
 @pytest.fixture(scope="module")
 def joined(true: Path, windows_wrong: tuple[Path, Patches]) -> tuple[Joined, Positions]:
     begun, patches = windows_wrong
     fixes = fixes_of(true, 2.0, 1)
-    return joining(begun, patches, loose(), [fixes], [], np.eye(3), np.zeros(5)).run(), fixes
+    return joining(begun, patches, loose(), stated(fixes), np.eye(3)).run(), fixes
 
 
 def shape_error(path: Path, true: Path) -> tuple[float, float]:
@@ -193,11 +201,11 @@ def test_without_common_ground_the_shape_is_the_windows_own(true: Path, windows_
     at = np.arange(0, len(true.quat), 20)
     attitudes = Attitudes(START_NS + at * STEP_NS, true.quat[at], np.deg2rad([1.0, 1.0, 2.0]), 10.0)
     stiff = replace(loose(), turn=loose().turn / 100, shift=loose().shift / 100)
-    result = joining(begun, none, stiff, [fixes_of(true, 2.0, 2)], [attitudes], np.eye(3), np.zeros(5)).run()
+    result = joining(begun, none, stiff, stated(fixes_of(true, 2.0, 2), attitudes), np.eye(3)).run()
     off, _ = shape_error(result.applied(begun), begun)
     assert off < 0.01
     assert result.log[-1]["apart_m"] == 0.0
-    assert (np.abs(result.compass[0]) < COMPASS_PRIOR).all()
+    assert (np.abs(result.values["compass"][0]) < COMPASS_PRIOR).all()
 
 
 def numeric(factor: Factor, again: list[Array], step: float) -> Array:
@@ -306,7 +314,7 @@ def test_only_ground_of_more_than_one_window_is_taken(windows_wrong: tuple[Path,
 
 def test_progress_comes_to_the_bytes_that_were_read() -> None:
     told: list[int] = []
-    pace = adjusted.Pace(lambda stage, done: told.append(done))
+    pace = Pace(lambda stage, done: told.append(done))
     for window in range(3):
         for _ in range(50):
             pace.read("adjust", 1001 + window)
@@ -321,14 +329,14 @@ def test_progress_comes_to_the_bytes_that_were_read() -> None:
 
 def test_the_mean_of_fixes_is_right_when_a_problem_is_solved(true: Path) -> None:
     """One row for the mean, by shift and turn of the whole; the course of the fixes leaves it alone."""
-    from groundproc.estimation.adjustment.anchors import fixes_name, mean_sigma, position_factors
+    from groundproc.estimation.observations.fixes import fixes_name, mean_sigma, position_factors
 
     path, given = flown(0, 300), fixes_of(flown(0, 300), 2.0, 4)
     unknowns = Unknowns(path.intervals)
     unknowns.add("world.turn", np.full(3, 1e-9))
     unknowns.add("world.shift", np.full(3, 100.0))
     unknowns.add(fixes_name(0), np.full(3, 100.0))
-    factors = [*position_factors(given, path, unknowns), prior_factor(unknowns, {})]
+    factors = [*position_factors(given, path, unknowns), prior_factor(unknowns)]
     factors[-1].sigma[: unknowns.path_size] = 1e-9
     normal, gradient = normal_equations(factors)
     found = np.linalg.solve(normal.toarray(), -gradient)[unknowns.names["world.shift"]]

@@ -5,11 +5,11 @@ import numpy.typing as npt
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from groundproc.estimation.adjustment.batch import Posterior
-from groundproc.estimation.adjustment.factors import Factor, Unknowns
-from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Carrying, Noise, followed, lasting, noise_of
-from groundproc.estimation.adjustment.planes import rows_of
+from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Noise, followed, lasting, noise_of
+from groundproc.estimation.adjustment.posterior import Posterior
 from groundproc.estimation.adjustment.solve import Problem, problem
+from groundproc.estimation.observations.planes import rows_of
+from groundproc.estimation.observations.rows import Carrying, Errors, Factor, Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from tests.helpers.circling import INTERVALS, circle, factors_of, room, unknowns_of_whole
 
@@ -31,15 +31,15 @@ def posed(unknowns: Unknowns) -> tuple[Problem, Noise]:
     factors = factors_of(unknowns)
     turn = [6 * k + axis for k in range(1, INTERVALS + 1) for axis in range(3)]
     whole = factors[0]
-    gyro = Factor("lidar gyro", whole.residual[turn], whole.matrix[turn], whole.sigma[turn])
+    carrying = Carrying(np.arange(INTERVALS), 1e-3 / np.sqrt(STEPS))
+    gyro = Factor("lidar gyro", whole.residual[turn], whole.matrix[turn], whole.sigma[turn], carrying=carrying)
     force = [6 * k + 3 + axis for k in range(INTERVALS // 2) for axis in range(3)]
     residual = np.random.default_rng(5).normal(size=len(force)) * whole.sigma[force]
-    felt = Factor("ins accelerometer", residual, whole.matrix[force], whole.sigma[force])
+    felt = Factor("ins accelerometer", residual, whole.matrix[force], whole.sigma[force], errors=Errors.LASTING)
     factors = [gyro, felt, *factors]
     linear = problem(rows, factors, unknowns, DEFLATION, path)
     x, _ = linear.solve(-linear.gradient)
-    by = Carrying("lidar gyro", np.ones(INTERVALS, np.bool_), 1e-3 / np.sqrt(STEPS))
-    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x, by)
+    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x)
 
 
 def parts(noise: Noise, values: Array) -> list[Array]:
@@ -122,3 +122,32 @@ def test_the_covariance_is_the_dense_sandwich(posed: tuple[Problem, Noise], unkn
         jacobian = np.stack([of(column) for column in np.eye(unknowns.size)], axis=1)
         expected = np.einsum("ij,jk,ik->i", jacobian, dense, jacobian)
         np.testing.assert_allclose(spread.variance(of), expected, rtol=share)
+
+
+def test_covariances_of_poses_are_the_dense_sandwich(posed: tuple[Problem, Noise], unknowns: Unknowns) -> None:
+    """All 21 numbers of a pose at five knots; of 60 draws a correlation is right to 1/8 where it is drawn, and most of it is not."""
+    linear, noise = posed
+    inverse = np.linalg.inv(np.stack([linear.apply(column) for column in np.eye(unknowns.size)], axis=1))
+    seen = np.stack([noise.seen(column) for column in np.eye(unknowns.size)])
+    posterior = Posterior(linear, unknowns, lambda: noise)
+    told = posterior.told(np.eye(unknowns.size))
+    dense = told @ inverse @ seen @ seen.T @ inverse.T @ told.T
+    knots = np.array([5, 20, 35, 50, 65])
+    place = circle().position_m[knots * STEPS]
+    names = unknowns.names
+
+    def poses(x: Array) -> Array:
+        coefficients = x[: unknowns.path_size].reshape(-1, 6)[knots]
+        turn = x[names["world.turn"]]
+        position = coefficients[:, 3:] + x[names["world.shift"]] + np.cross(turn, place)
+        return np.hstack([position, coefficients[:, :3] + turn])
+
+    jacobian = np.stack([poses(column) for column in np.eye(unknowns.size)], axis=2)
+    expected = jacobian @ dense @ np.swapaxes(jacobian, 1, 2)
+    sigma = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+    known, drawn = posterior.spread(60).moments(poses)
+    found = (known + drawn) / (sigma[:, :, None] * sigma[:, None, :])
+    np.testing.assert_allclose(found, expected / (sigma[:, :, None] * sigma[:, None, :]), atol=3.0 / np.sqrt(60))
+    # what needs no drawing is most of where the whole lies
+    shares = np.diagonal(known, axis1=1, axis2=2)[:, :3] / np.square(sigma[:, :3])
+    assert shares.min() > 0.8

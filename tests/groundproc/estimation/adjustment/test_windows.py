@@ -5,9 +5,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from flightlog import frames
-from groundproc.estimation.adjustment.anchors import Tie
-from groundproc.estimation.adjustment.batch import turned
 from groundproc.estimation.adjustment.windows import Window, _laid_on, joined_path
+from groundproc.estimation.observations.rows import Unknowns, turned
+from groundproc.estimation.observations.tie import Tie
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
 
@@ -25,7 +25,7 @@ def flown(first: int, last: int) -> Path:
 
 def window(first: int, last: int, path: Path) -> Window:
     none = np.zeros((last - first + 1, 3))
-    return Window(first, last, last - first, path, {}, none, none, [])
+    return Window(first, last, last - first, path, {}, Unknowns(last - first), none, none, [])
 
 
 def off(a: Path, b: Path) -> tuple[Array, Array]:

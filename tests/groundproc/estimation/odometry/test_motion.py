@@ -8,7 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from flightlog.constants import NS_PER_S
-from groundproc.estimation.adjustment.adjusted import RECOVERY_NS, measured
+from groundproc.estimation.observations.fixes import RECOVERY_NS, measured
 from groundproc.estimation.odometry.grid import STEP_NS
 from groundproc.estimation.odometry.motion import LONGEST_SAMPLE_GAP_NS, on_grid
 

@@ -10,20 +10,14 @@ import pytest
 
 from flightlog import frames
 from flightlog.constants import STANDARD_GRAVITY_M_S2
+from groundproc.estimation.odometry.bearing import Bearing
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.matching import observable
 from groundproc.estimation.odometry.motion import Motion
-from groundproc.estimation.odometry.odometry import (
-    GYRO,
-    POSITION,
-    ROTATION,
-    STATES,
-    VELOCITY,
-    Odometry,
-    State,
-    observable,
-)
+from groundproc.estimation.odometry.odometry import Odometry
 from groundproc.estimation.odometry.slices import Slice
-from groundproc.estimation.odometry.track import LOST_M, Bearing
+from groundproc.estimation.odometry.state import GYRO, POSITION, ROTATION, STATES, VELOCITY, State
+from groundproc.estimation.odometry.tracker import LOST_M
 
 Array = npt.NDArray[np.float64]
 START_NS = 1_779_000_000_000_000_000

@@ -1,4 +1,4 @@
-"""Splines and the path they correct, against scipy's B-splines and rotations."""
+"""The path and the spline that corrects it, against scipy's B-splines and rotations."""
 
 import numpy as np
 import numpy.typing as npt
@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from flightlog import frames
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
-from groundproc.estimation.odometry.spline import Path, basis, integrated, smooth_path
+from groundproc.estimation.odometry.spline import Path, integrated, smooth_path
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 7
@@ -24,12 +24,6 @@ def wavy(intervals: int = INTERVALS) -> Path:
     turn = np.stack([0.5 * np.sin(3 * seconds), 0.4 * np.cos(4 * seconds), 2.0 * seconds], axis=1)
     place = np.stack([5 * seconds, np.sin(2 * seconds), 10 + 0.3 * np.cos(5 * seconds)], axis=1)
     return Path(10**18, frames.quat_exp(turn), place)
-
-
-def test_the_weights_are_scipys() -> None:
-    coefficients = np.eye(4)
-    for u in np.linspace(0.0, 1.0, 21):
-        np.testing.assert_allclose(basis(float(u)), scipys(coefficients)(u), atol=1e-15)
 
 
 def test_a_path_is_turned_in_the_body_and_moved_by_the_spline() -> None:

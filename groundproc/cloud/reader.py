@@ -1,0 +1,208 @@
+"""Clouds from LAS and LAZ files of any version and point format, ours and other programs': `Points` in chunks, in the order of the file."""
+
+import contextlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+import pyproj
+from laspy.header import GpsTimeType
+from pyproj.exceptions import CRSError
+
+from flightlog.constants import NS_PER_S
+from flightlog.errors import CaptureError
+from groundproc.cloud.dimensions import TABLE, Dimension, in_order
+from groundproc.cloud.gpstime import Clock
+from groundproc.cloud.points import Points
+from groundproc.flight.positions.scales import WEEK_NS
+
+CHUNK: Final = 1_000_000
+"""Points that are in memory at once."""
+DAMAGE: Final = (laspy.errors.LaspyException, ValueError, RuntimeError, EOFError, OverflowError)
+"""What laspy and lazrs raise for damaged files; lazrs' own error is a RuntimeError."""
+_LEGACY: Final = {"scan_angle": ("scan_angle_rank", 1.0)}
+"""Fields of point formats 0 to 5 that have another name, and a step in the unit of the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """A file and what its header says.
+
+    Attributes
+    ----------
+    path : Path
+    points : int
+    columns : tuple of str
+        Names of the table's attributes that its points have.
+    timed : bool
+        Points have times.
+    week_time : bool
+        Times are seconds of the GPS week; else adjusted standard GPS time. As the header says, unless the times cannot be that.
+    crs : pyproj.CRS or None
+        As the file states it.
+    """
+
+    path: Path
+    points: int
+    columns: tuple[str, ...]
+    timed: bool
+    week_time: bool
+    crs: pyproj.CRS | None
+
+    @property
+    def horizontal(self) -> pyproj.CRS | None:
+        """Horizontal part of the CRS."""
+        return self.crs.sub_crs_list[0] if self.crs is not None and self.crs.is_compound else self.crs
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Points of a file.
+
+    Attributes
+    ----------
+    points : Points
+        What the table knows of them.
+    record : laspy.ScaleAwarePointRecord
+        All that the file holds of them, as stored: what `Rewriter` writes anew.
+    """
+
+    points: Points
+    record: Any
+
+
+def look(path: Path) -> Cloud:
+    """Read a header.
+
+    Raises
+    ------
+    CaptureError
+        It is no LAS file, holds no point, or its CRS is nonsense.
+    """
+    with opened(path) as reader:
+        header = reader.header
+        if header.point_count == 0:
+            raise CaptureError(f"{path}: holds no points")
+        try:
+            crs = header.parse_crs()
+        except CRSError as error:
+            raise CaptureError(f"{path}: its CRS cannot be understood ({error})") from None
+        columns = tuple(entry.name for entry in TABLE if _step(entry, header.point_format) is not None)
+        timed = "gps_time" in header.point_format.dimension_names
+        weekly = timed and header.global_encoding.gps_time_type != GpsTimeType.STANDARD
+        if weekly:
+            # many programs leave the bit unset with times that no week has
+            time = np.asarray(next(_records(path, reader)).gps_time, np.float64)
+            weekly = bool(((time >= 0.0) & (time < 2.0 * WEEK_NS / NS_PER_S)).all())
+        return Cloud(path, header.point_count, columns, timed, weekly, crs)
+
+
+def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None) -> Iterator[Chunk]:
+    """All points of a file.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    clock : Clock, optional
+        How its times become UTC. None: times are not asked for, and `time_ns` is 0.
+    columns : collection of str, optional
+        Those wanted, of `cloud.columns`; default: all.
+
+    Raises
+    ------
+    CaptureError
+        The file is damaged, or has no times though a clock is given.
+    """
+    if clock is not None and not cloud.timed:
+        raise CaptureError(f"{cloud.path}: its points have no gps_time, expected the time of each point")
+    wanted = in_order(cloud.columns if columns is None else set(columns) & set(cloud.columns))
+    with opened(cloud.path) as reader:
+        seen = 0
+        for record in _records(cloud.path, reader):
+            seen += len(record)
+            xyz = np.stack([record.x, record.y, record.z], axis=1).astype(np.float64)
+            time_ns = np.zeros(len(record), np.int64)
+            if clock is not None:
+                time_ns = clock.utc_ns(cloud.path, cloud.week_time, np.asarray(record.gps_time, np.float64))
+            values = {entry.name: _column(entry, record) for entry in wanted}
+            yield Chunk(Points(time_ns, xyz, values), record)
+        if seen != cloud.points:
+            raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
+
+
+def _step(entry: Dimension, point_format: Any) -> tuple[str, float | None] | None:
+    """How a point format calls an attribute of the table, and its step there (None: stored as it is); None: it has none.
+
+    Extra bytes are the table's attribute if they have its name, state its unit and fit into its column.
+    """
+    name, step = entry.field or entry.name, entry.scale
+    if entry.field and name not in point_format.dimension_names:
+        name, step = _LEGACY.get(name, (name, step))
+    if name not in point_format.dimension_names:
+        return None
+    if entry.field:
+        return name, step
+    found = point_format.dimension_by_name(name)
+    if found.num_elements != 1 or (entry.unit and f"[{entry.unit}]" not in found.description):
+        return None
+    own = None if found.scales is None else float(found.scales[0])
+    if entry.scale is None and (own is not None or not np.can_cast(found.dtype, entry.stored, "safe")):
+        return None
+    return name, own
+
+
+def _column(entry: Dimension, record: Any) -> npt.NDArray[Any]:
+    """One attribute of a piece of a file, in the unit of the table."""
+    found = _step(entry, record.point_format)
+    assert found is not None
+    name, step = found
+    if entry.scale is None:
+        return np.asarray(record[name]).astype(entry.column)
+    if entry.field:
+        return (np.asarray(record[name]) * (step or 1.0)).astype(entry.column)
+    stored = record.array[name]
+    offsets = record.point_format.dimension_by_name(name).offsets
+    values = stored * (1.0 if step is None else step) + (0.0 if offsets is None else float(offsets[0]))
+    if entry.no_data is not None:
+        values = np.where(stored == entry.no_data, np.nan, values)
+    return np.asarray(values, entry.column)
+
+
+def _records(path: Path, reader: Any) -> Iterator[Any]:
+    points = reader.chunk_iterator(CHUNK)
+    while True:
+        try:
+            record = next(points)
+        except StopIteration:
+            return
+        except DAMAGE as error:
+            raise CaptureError(f"{path}: is damaged ({sentence(error)})") from None
+        yield record
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """A file, read by laspy.
+
+    Raises
+    ------
+    CaptureError
+        It cannot be read, or is no LAS file.
+    """
+    try:
+        reader = laspy.open(path)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except DAMAGE as error:
+        raise CaptureError(f"{path}: is no LAS or LAZ file ({sentence(error)})") from None
+    with reader:
+        yield reader
+
+
+def sentence(error: BaseException) -> str:
+    """What an error of laspy says, on one line."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,102 @@
+"""The odometry alone as an estimate: nothing of the future is used."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.mount import Mount
+from groundproc.estimation.adjustment.sensorpath import lost, of_ins
+from groundproc.estimation.method import Given, Progress
+from groundproc.estimation.observations.attitudes import ATTITUDE_SIGMA_RAD, attitude_track
+from groundproc.estimation.observations.fixes import position_track
+from groundproc.estimation.observations.rows import H
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
+from groundproc.estimation.odometry.slices import slices
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Recorded
+from groundproc.estimation.odometry.track import Track
+from groundproc.estimation.odometry.tracker import Tracker, tracked
+from groundproc.flight.timeline import Leg
+from groundproc.sensors.lasers import LaserCorrections
+from groundproc.trajectory.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class CausalRun:
+    """The odometry alone: what was known at each moment, a tenth of a second late."""
+
+    SIGMA_SOURCE: ClassVar = (
+        "the filter's covariance; position and heading as uncertain as the fix and the compass that it began from"
+    )
+
+    path: Path
+    track: Track
+    motion: Motion
+    start_sigma_m: Array
+
+    def mount(self, nominal: Mount) -> Mount:
+        """The nominal mount: nothing else is known in time."""
+        return nominal
+
+    def trajectory(self, given: Given, mount: Mount) -> Trajectory:
+        """The path as that of the ins frame."""
+        sigma = np.array([self.track.sigma[0], *self.track.sigma])
+        grid, knots = np.arange(len(self.path.quat)), np.arange(len(sigma)) * STEPS
+        attitude, position = (
+            np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (sigma[:, :3], sigma[:, 3:])
+        )
+        attitude = np.hypot(attitude, ATTITUDE_SIGMA_RAD * np.array([1.0, 1.0, 2.5]))
+        return of_ins(self.path, self.motion, given.frame, mount, np.hypot(position, self.start_sigma_m), attitude)
+
+    def corrections(self) -> None:
+        """The lasers are taken as they are given."""
+
+    def lasers(self, nominal: LaserCorrections, count: int) -> LaserCorrections:
+        """As they were given."""
+        del count
+        return nominal
+
+    def mount_source(self, nominal: str) -> str:
+        """The nominal mount's."""
+        return nominal
+
+    def mount_sigma(self, nominal: Mount) -> None:
+        """Nothing is said of it."""
+
+    def is_worse(self) -> bool:
+        """It is what it is."""
+        return False
+
+    def warnings(self) -> list[str]:
+        """What the self-check found."""
+        return lost(self.track)
+
+    def report(self, nominal: Mount) -> dict[str, Any]:
+        """What stands in quality.json."""
+        del nominal
+        return {
+            "causal": True,
+            "seconds": len(self.track) * H,
+            "restarts": self.track.restarts,
+            "median_matched": float(np.median(self.track.matched)),
+            "median_residual_m": float(np.nanmedian(self.track.residual_m)),
+        }
+
+
+def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory, progress: Progress) -> CausalRun:
+    """Odometry over one run of the lidar's clock, nothing of the future used but the gyro's offset."""
+    motion, own, other = base_motion(given, legs[0], given.flight.runs[number])
+    positions = position_track(given, legs[0])
+    mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
+    stated = Recorded(positions, attitude_track(legs[0]))
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, keep=False)
+    for piece in slices(given, motion.start_ns, progress):
+        tracker.feed(piece)
+    track = tracked(tracker)
+    return CausalRun(track.causal_path(motion), track, motion, positions.sigma_m[0])

@@ -1,0 +1,296 @@
+"""The autopilot's GNSS positions: metres, with errors that last for a minute and more."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from flightlog.constants import NS_PER_S
+from groundproc.estimation.method import Given
+from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, Stated, turned_by
+from groundproc.estimation.observations.moments import means, poses, seconds, spots, velocities, within
+from groundproc.estimation.observations.observation import Flown, Observation, Outcome, State
+from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, cross, eye, whitened
+from groundproc.estimation.observations.source import Clock
+from groundproc.estimation.observations.states import (
+    ATTITUDE,
+    FIX_AGE,
+    FIX_POSITION,
+    FIX_VELOCITY,
+    POSITION,
+    VELOCITY,
+)
+from groundproc.estimation.odometry.spline import Path
+from groundproc.estimation.odometry.stated import Positions
+from groundproc.flight.autopilot import Boot
+from groundproc.flight.sync.tracks import low_pass
+from groundproc.flight.timeline import Leg
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+POSITION_TAU_S: Final = np.array([60.0, 60.0, 300.0])
+POSITION_WHITE_M: Final = 0.1
+"""Errors of a GNSS receiver that smooths last for a minute, those of a height that the barometer carries for longer (east, north, up);
+a tenth of a metre is new each second."""
+LEAST_POSITION_SIGMA_M: Final = 0.02
+DELAY_SIGMA_S: Final = 0.0
+"""How well the delay of the fixes beyond that of the autopilot's clock is known; 0: it is none, and is held. Metres of lasting errors do
+not tell a delay: 5 m/s and 0.1 s are half a metre, in a direction that changes with the course."""
+DRIFT_S: Final = 10
+SLID_SIGMAS: Final = 6.0
+"""A path that slides away from the fixes by more, in `DRIFT_S`, is worth a warning."""
+WRONG_SIGMAS: Final = 4.0
+"""A path whose distance from the fixes is more, RMS, is worth a warning."""
+SLID: Final = "position_drift"
+"""Of the figures of a step: how far the path slides away from the fixes."""
+
+
+@dataclass(slots=True)
+class Fixes(Observation):
+    """The positions of one leg.
+
+    Attributes
+    ----------
+    name : str
+    given : Positions
+    number : int
+        Of the leg: each has a mean error of its own.
+    clock : Clock
+    """
+
+    name: str
+    given: Positions
+    number: int
+    clock: Clock
+
+    def joined(self, values: Mapping[str, Array], kept: Sequence[Any]) -> "Fixes":
+        """With the delay as the windows found it."""
+        del kept
+        return replace(self, clock=self.clock.held(values))
+
+    def unknowns(self, unknowns: Unknowns) -> None:
+        """The mean error, and the delay where it is free."""
+        unknowns.add(fixes_name(self.number), np.full(3, 100.0), unit="m")
+        self.clock.unknowns(unknowns)
+
+    def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
+        """The course of the positions, and their mean."""
+        return position_factors(self.given, state.path, unknowns, self.number, self.clock)
+
+    def take(self, part: Mapping[str, Array], path: Path) -> None:
+        """The mean error is told anew in each step."""
+        del path
+        self.clock = self.clock.taken(part)
+
+    def figures(self, factors: Sequence[Factor]) -> dict[str, float]:
+        """Whether the path slides away."""
+        return {f"{factor.name}_rms": factor.rms() for factor in factors} | {SLID: drift(factors)}
+
+    def warnings(self, outcome: Outcome) -> list[str]:
+        """A path that goes where the fixes do not."""
+        found = []
+        slid = outcome.largest(SLID)
+        if slid > SLID_SIGMAS:
+            found.append(
+                f"for {DRIFT_S} s the path slides away from the GNSS positions by {slid:.1f} sigma, expected under {SLID_SIGMAS:.0f}; "
+                + (
+                    "the trajectory is what the adjustment began from"
+                    if outcome.misled
+                    else "the lidar may have been misled there"
+                )
+            )
+        off = outcome.largest("position_rms")
+        if off > WRONG_SIGMAS:
+            found.append(
+                f"the path differs from the GNSS positions by {off:.1f} sigma, expected 1; one of them is wrong"
+            )
+        return found
+
+
+def of_run(flown: Flown) -> list[Observation]:
+    """One for each leg."""
+    return [
+        Fixes(f"fixes{number}", position_track(flown.given, leg), number, Clock(f"fixes{number}.delay", DELAY_SIGMA_S))
+        for number, leg in enumerate(flown.legs)
+    ]
+
+
+def drift(factors: Sequence[Factor]) -> float:
+    """Largest mean of ten whitened position residuals on end, in sigmas of such a mean: a path that slides away from the fixes."""
+    largest = 0.0
+    for factor in factors:
+        if factor.name == "position" and len(factor.residual) > 3 * DRIFT_S:
+            whitened = (factor.residual / factor.sigma).reshape(-1, 3)
+            sums = np.cumsum(whitened, axis=0)
+            largest = max(largest, float(np.abs(sums[DRIFT_S:] - sums[:-DRIFT_S]).max()) / np.sqrt(DRIFT_S))
+    return largest
+
+
+def fixes_name(number: int) -> str:
+    """The unknown that the mean error of the n-th source of positions is."""
+    return f"world.fixes{number}"
+
+
+def position_factors(
+    given: Positions, path: Path, unknowns: Unknowns, number: int = 0, clock: Clock | None = None
+) -> list[Factor]:
+    """Positions in means of a second: their course, and their mean; none where the path covers fewer than two.
+
+    The course alone, with an unknown mean error, bends and turns the path. Where the whole lies is left to the plain mean of the fixes,
+    by 1 / sigma^2: the best weights of errors that last would lay two thirds of a minute's weight on its first and last fix, and are best
+    by a tenth at most, if the errors last as long as stated and not otherwise.
+    """
+    stamps_ns = given.time_ns if clock is None else clock.ours_ns(given.time_ns)
+    inside = within(stamps_ns, path)
+    if inside.sum() < 2:
+        return []
+    time_ns = stamps_ns[inside]
+    _, _, step, share = spots(time_ns, path)
+    quat, position = poses(path, step, share)
+    off = position + frames.mat_from_quat(quat) @ given.lever_m - given.position_m[inside]
+    group, middle = seconds(time_ns)
+    residual, sigma = means(off, group), means(given.sigma_m[inside], group)
+    knot, weights, _, _ = spots(time_ns[middle], path)
+    count = len(middle)
+    builder, row = RowBuilder(3 * count, unknowns), 3 * np.arange(count)
+    builder.at_times(row, knot, weights, 3, eye(count))
+    builder.by(row, "world.turn", -cross(position[middle]))
+    builder.by(row, "world.shift", eye(count))
+    if fixes_name(number) in unknowns.names:
+        builder.by(row, fixes_name(number), -eye(count))
+    if clock is not None:
+        clock.add(builder, row, means(velocities(path, step, given.lever_m), group))
+    time_s = (time_ns[middle] - time_ns[0]) * 1e-9
+    course = whitened("position", residual, builder.matrix(), time_s, sigma, given.tau_s, given.white_m, Errors.ANCHOR)
+    if fixes_name(number) not in unknowns.names:
+        return [course]
+    return [course, _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)]
+
+
+SAMPLES: Final = 8
+"""Moments of the flight by which the mean of the fixes is stated."""
+
+
+def _mean_factor(
+    residual: Array, position_m: Array, spline: tuple[Ints, Array], time_s: Array, sigma: Array, given: Positions,
+    unknowns: Unknowns,
+) -> Factor:  # fmt: skip
+    """The mean of the residuals, shape (n, 3), as three rows.
+
+    By every coefficient of the spline they would be dense. So they are stated by a few moments of the flight, with weights by which
+    all that moves or turns the path as one moves their mean as it moves the mean of all. Bends are seen a little wrong; as the
+    residual is that of the path as it is, that costs a step and not the result.
+    """
+    weights = sigma**-2.0 / (sigma**-2.0).sum(axis=0)
+    builder, row = RowBuilder(3, unknowns), np.zeros(1, np.int64)
+    centre = weights.T @ position_m
+    some = np.unique(np.linspace(0, len(time_s) - 1, SAMPLES).round().astype(np.int64))
+    shares = np.stack([_shares(position_m[some] - centre[axis]) for axis in range(3)], axis=1)
+    for i, share in zip(some, shares, strict=True):
+        builder.at_times(row, spline[0][i : i + 1], spline[1][i : i + 1], 3, np.diag(share)[None])
+    builder.by(row, "world.turn", np.stack([-cross(centre)[axis, axis] for axis in range(3)])[None])
+    builder.by(row, "world.shift", eye(1))
+    deviation = mean_sigma(time_s, sigma, weights, given.tau_s, given.white_m)
+    return Factor("position mean", (weights * residual).sum(axis=0), builder.matrix(), deviation, errors=Errors.ANCHOR)
+
+
+def _shares(places: Array) -> Array:
+    """Weights, sum 1, by which places, shape (n, 3), have their mean in the origin as nearly as may be; the most even ones."""
+    even = np.full(len(places), 1.0 / len(places))
+    asked = np.concatenate([np.ones((1, len(places))), places.T])
+    return np.asarray(even + np.linalg.pinv(asked, 1e-6) @ (np.array([1.0, 0.0, 0.0, 0.0]) - asked @ even))
+
+
+def mean_sigma(time_s: Array, sigma: Array, weights: Array, tau_s: Array, white: float) -> Array:
+    """Sigma of a weighted mean of Gauss-Markov errors of `sigma`, shape (n, m), and white ones; in one pass over time."""
+    part = weights * sigma
+    variance = np.square(part).sum(axis=0) + white**2 * np.square(weights).sum(axis=0)
+    keep = np.exp(-np.diff(time_s)[:, None] / tau_s)
+    before = np.zeros_like(part[0])
+    for i in range(1, len(part)):
+        before = keep[i - 1] * (before + part[i - 1])
+        variance += 2.0 * part[i] * before
+    return np.asarray(np.sqrt(variance))
+
+
+def position_track(given: Given, leg: Leg) -> Positions:
+    """The autopilot's positions in the local frame."""
+    fixes = given.fixes[list(given.placed).index(leg)]
+    place = given.frame.from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)
+    mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
+    antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
+    good = measured(leg.boot, fixes.time_ns)
+    return Positions(
+        leg.utc_from_boot(fixes.time_ns[good]),
+        place[good],
+        np.maximum(fixes.sigma_m[good], LEAST_POSITION_SIGMA_M),
+        mat.T @ (antenna - lever),
+        POSITION_TAU_S,
+        POSITION_WHITE_M,
+    )
+
+
+RECOVERY_NS: Final = 30 * NS_PER_S
+"""So long after a fix is back, the autopilot's position still comes back from where it had drifted to."""
+
+
+def measured(boot: Boot, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Which positions rest on satellites: without a fix an autopilot goes on with a position that drifts away, and says so elsewhere."""
+    if not boot.has("GPS_RAW_INT", 2):
+        return np.ones(len(time_ns), np.bool_)
+    gps_ns, fixed = boot.stamps_ns["GPS_RAW_INT"], boot.tables["GPS_RAW_INT"]["fix_type"] >= 3
+    row = np.clip(np.searchsorted(gps_ns, time_ns, side="right") - 1, 0, len(gps_ns) - 1)
+    # a message late: between the last with a fix and the first without, it may be lost already
+    good = fixed[row] & fixed[np.minimum(row + 1, len(fixed) - 1)]
+    for regained_ns in gps_ns[1:][fixed[1:] & ~fixed[:-1]].tolist():
+        good &= (time_ns < regained_ns) | (time_ns > regained_ns + RECOVERY_NS)
+    return np.asarray(good if good.sum() >= 2 else np.ones(len(time_ns), np.bool_))
+
+
+NOISE: Final = {
+    "fix position": Learnt("fix_noise_m", 0.02, 5.0),
+    "fix velocity": Learnt("fix_velocity_noise_m_s", 0.02, 3.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FixRows(Measured):
+    """The same in the smoother, with the velocities that come along: there errors that last are states, and so is the fixes' age."""
+
+    stated: Stated
+    learnt: Mapping[str, Learnt] = field(default_factory=lambda: NOISE)
+
+    def rows(self, rows: Rows) -> None:
+        """Positions, and velocities where there are any."""
+        stated, model = self.stated, rows.model
+        place, inside = rows.at(stated.fix_s)
+        mat = frames.mat_from_quat(place.quat)
+        arm = mat @ stated.lever_m
+        by_turn = turned_by(arm)
+        left = stated.fix_m[inside] - place.position_m - arm
+        for axis in range(3):
+            columns = [(POSITION + axis, 1.0), (FIX_POSITION + axis, 1.0), (FIX_AGE, -place.velocity_m_s[:, axis])]
+            if stated.lever_m.any():
+                columns += [(ATTITUDE + i, by_turn[:, axis, i]) for i in range(3)]
+            rows.add("fix position", place.node, columns, left[:, axis], model.fix_noise_m)
+        if stated.fix_velocity_m_s is None:
+            return
+        swing = np.einsum("nij,nj->ni", mat, np.cross(place.rate_rad_s, stated.lever_m))
+        left = stated.fix_velocity_m_s[inside] - place.velocity_m_s - swing
+        step_s = rows.step_ns * 1e-9
+        gaining = np.gradient(low_pass(rows.reference.velocity_m_s, 1.0, 1.0 / step_s), step_s, axis=0)[place.node]
+        for axis in range(3):
+            columns = [(VELOCITY + axis, 1.0), (FIX_VELOCITY + axis, 1.0), (FIX_AGE, -gaining[:, axis])]
+            # the error of a position's own velocity is how fast the position's error changes, its decay included
+            if stated.linked:
+                columns.append((FIX_POSITION + axis, -1.0 / model.fix_tau_s))
+            rows.add("fix velocity", place.node, columns, left[:, axis], model.fix_velocity_noise_m_s)
+
+
+def of_leg(heard: Heard) -> list[Measured]:
+    """The positions of a leg."""
+    return [FixRows(heard.stated)]

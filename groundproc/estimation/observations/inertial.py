@@ -1,0 +1,124 @@
+"""An inertial unit as an observation of the adjustment: its gyro and its accelerometer, which share axes, clock and place."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from groundproc.estimation.observations import accelerometer, gyro
+from groundproc.estimation.observations.observation import Flown, Observation, State, Stretch
+from groundproc.estimation.observations.rows import Carrying, Factor, Unknowns, turned
+from groundproc.estimation.observations.unit import Unit, make_unit, place_on_grid, robust_sigma
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.motion import ImuTrack
+from groundproc.estimation.odometry.spline import Path
+
+Array = npt.NDArray[np.float64]
+
+PRIORS: Final[dict[str, float]] = gyro.PRIORS | accelerometer.PRIORS | {"ins.delay": 0.01, "ins.drift": 60e-6}
+"""What is known before, one sigma, of the globals by their names. The lidar's own unit has the lidar's clock; of the autopilot's are
+unknown the delay beyond the synchronisation's [s] and how it drifts, two crystals against each other [s/s]."""
+ORDER: Final = ("bias", "scale", "shear", "turn", "accel_bias", "accel_turn", "lever", "delay", "drift")
+UNITS: Final = {
+    "bias": "deg_s", "scale": "", "shear": "", "turn": "deg", "accel_bias": "m_s2", "accel_turn": "deg", "lever": "m", "delay": "s",
+    "drift": "",
+}  # fmt: skip
+"""Of the globals in reports."""
+LEAST_SHARE: Final = 0.4
+"""Of what a unit's samples scatter, vibration included: its noise is not taken to be below that, because where the lidar sees nothing the
+path is the unit's own and leaves no residuals."""
+
+
+@dataclass(slots=True)
+class Inertial(Observation):
+    """Gyro and accelerometer of one unit.
+
+    Attributes
+    ----------
+    name : str
+        "lidar" or "ins": prefix of its globals.
+    track : ImuTrack
+    lever_m : ndarray, shape (3,)
+        Nominal place, sensor frame.
+    carries : bool
+        Its gyro is the path's motion between knots.
+    unit : Unit
+        On the grid of the window; None before it begins.
+    """
+
+    name: str
+    track: ImuTrack
+    lever_m: Array
+    carries: bool
+    unit: Unit | None = None
+
+    def begin(self, stretch: Stretch) -> "Inertial":
+        """With the bias that the odometry found, where it went by this gyro."""
+        bias = stretch.bias_rad_s if self.track.name == stretch.carried_by else np.zeros(3)
+        return replace(self, unit=make_unit(self.name, self.track, stretch.path, bias, self.lever_m))
+
+    def joined(self, values: Mapping[str, Array], kept: Any) -> None:
+        """The windows' shapes and tilts are its own."""
+
+    def unknowns(self, unknowns: Unknowns) -> None:
+        """Those of the accelerometer only where it was heard, those of the clock where it is another than the lidar's."""
+        unit = self._begun()
+        names = [*gyro.NAMES, *(accelerometer.NAMES if unit.force_known.any() else ()), "delay", "drift"]
+        for name in ORDER:
+            key = f"{self.name}.{name}"
+            if name in names and key in PRIORS:
+                value = unit.values[name]
+                expected = self.lever_m if name == "lever" else None
+                unknowns.add(key, np.full(len(value), PRIORS[key]), value, expected, UNITS[name])
+
+    def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
+        """Turns of each slice and forces about each knot, with the noise that their residuals show once that is to be learnt.
+
+        Learnt again and again, the path would follow the units and their noise seem to vanish.
+        """
+        unit = self._begun()
+        turn = gyro.turn_factor(unit, state.path, unknowns)
+        if state.learn:
+            unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), LEAST_SHARE * unit.sigma_turn_rad)
+            turn.sigma[:] = unit.sigma_turn_rad
+        if self.carries:
+            interval = np.flatnonzero(unit.known.reshape(-1, STEPS).all(axis=1))
+            turn.carrying = Carrying(interval, unit.sigma_turn_rad / float(np.sqrt(STEPS)))
+        if not unit.force_known.any():
+            return [turn]
+        force = accelerometer.force_factor(unit, state.path, unknowns)
+        if state.learn:
+            unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), LEAST_SHARE * unit.sigma_force_m_s2)
+            force.sigma[:] = unit.sigma_force_m_s2
+        return [turn, force]
+
+    def take(self, part: Mapping[str, Array], path: Path) -> None:
+        """A changed clock puts the samples elsewhere on the grid."""
+        unit = self._begun()
+        for name, value in unit.values.items():
+            change = part.get(f"{self.name}.{name}")
+            if change is None:
+                continue
+            if name == "turn":
+                mat = turned(change) @ turned(value)
+                unit.values[name] = frames.quat_log(frames.quat_from_mat(mat[None]))[0]
+            else:
+                unit.values[name] = value + change
+        if f"{self.name}.delay" in part:
+            place_on_grid(unit, self.track, path)
+
+    def _begun(self) -> Unit:
+        assert self.unit is not None, "the window has not begun"
+        return self.unit
+
+
+def of_run(flown: Flown) -> list[Observation]:
+    """The units of a run, the one that carries the motion first."""
+    at = {"ins": flown.in_sensor(np.zeros(3))}
+    return [
+        Inertial(name, track, at.get(name, np.zeros(3)), number == 0)
+        for number, (name, track) in enumerate(flown.units.items())
+    ]

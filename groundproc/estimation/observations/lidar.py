@@ -1,0 +1,86 @@
+"""What the lidar sees, as an observation: planes of voxels, solved for within, and the corrections of the single lasers.
+
+Its rows are hundreds of thousands and touch each other all over the flight, so they are no `Factor`: the engine asks for them as
+`planes.Rows`, which are applied and never written down. All else, the unknowns, the solution and the self-check, is as for the others.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.estimation.observations import lasers
+from groundproc.estimation.observations.observation import Observation, Outcome, State
+from groundproc.estimation.observations.planes import Rows, rows_of
+from groundproc.estimation.observations.rows import Factor, Unknowns
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.spline import Path
+
+Array = npt.NDArray[np.float64]
+
+DEFLATION: Final = 4.0
+"""The lidar's information is divided by this: errors of neighbouring clusters are not independent. Checked by the share of errors within
+two sigmas (tests)."""
+MOST: Final = 1000
+"""Rows of a slice, at most."""
+WORSE: Final = 2.0
+"""Residuals so many times what their noise explains are worth a warning."""
+
+
+@dataclass(slots=True)
+class Lidar(Observation):
+    """The clusters of a window on their planes.
+
+    Attributes
+    ----------
+    clusters : Clusters
+        Those of single lasers are corrected in place.
+    corrections : ndarray, shape (64,)
+        Of the lasers, so far; they stay 0 where the clusters have none.
+    """
+
+    clusters: Clusters
+    corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
+    name: str = "lidar planes"
+
+    def unknowns(self, unknowns: Unknowns) -> None:
+        """Offsets of the lasers where they are asked for; they have to follow the path."""
+        if self.clusters.laser is None:
+            return
+        count = len(lasers.NAMES)
+        priors, values = np.split(lasers.PRIOR, count), np.split(self.corrections, count)
+        for name, prior, value in zip(lasers.NAMES, priors, values, strict=True):
+            unknowns.add(name, prior, value)
+
+    def rows(self, path: Path, voxel_m: float, cut: bool) -> Rows:
+        """Distances from planes, linear about a path; voxels have edges of `voxel_m`, outliers are `cut` or only weigh less."""
+        return rows_of(self.clusters, path, voxel_m, MOST, cut)
+
+    def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
+        """None: see `rows`."""
+        del state, unknowns
+        return []
+
+    def take(self, part: Mapping[str, Array], path: Path) -> None:
+        """Shift what each laser saw."""
+        del path
+        if self.clusters.laser is not None:
+            offsets = np.concatenate([part[name] for name in lasers.NAMES])
+            self.clusters.xyz_m = lasers.shifted(self.clusters.xyz_m, self.clusters.laser, offsets)
+            self.corrections = self.corrections + offsets
+
+    def warnings(self, outcome: Outcome) -> list[str]:
+        """A map that is not one."""
+        return plane_warnings(outcome)
+
+
+def plane_warnings(outcome: Outcome) -> list[str]:
+    """One sentence where the lidar's residuals are not noise."""
+    chi_square = outcome.largest("chi_square")
+    if chi_square <= WORSE:
+        return []
+    return [
+        f"the lidar's residuals are {chi_square:.1f} times what their noise explains, expected 1 or less; the cloud may be doubled"
+    ]

@@ -1,0 +1,371 @@
+"""What the lidar says: clusters on the planes of their voxels, as rows that tell of the path (`numerics.planerows`)."""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.ndimage import uniform_filter1d
+
+from groundproc.estimation.observations.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEPS
+from groundproc.estimation.odometry.matching import GROUND, observable
+from groundproc.estimation.odometry.spline import Path, PathArrays
+from groundproc.numerics.planerows import PlaneRows, RowArrays
+from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
+from groundproc.numerics.rotations import mat_of_quat
+from groundproc.numerics.splines import basis
+from groundproc.numerics.voxelhash import assign, sorted_by, spread
+
+Array = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
+Knots = npt.NDArray[np.int32]
+
+RANGE_SIGMA_M: Final = 0.02
+"""Noise of a return (data sheet); what a voxel's own residuals show comes on top."""
+ROUGHNESS_M: Final = 0.006
+"""Roughness of a surface before its residuals tell, one sigma of a cluster [m]."""
+GROUND_SLICES: Final = 201
+"""Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
+SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
+"""What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
+
+
+@dataclass(slots=True)
+class Rows(PlaneRows):
+    """Rows of a path, with the corrections of the lasers as further unknowns where they are asked for.
+
+    Attributes
+    ----------
+    lasers : LaserColumns, optional
+        By the corrections of the lasers, whose unknowns follow those of the path.
+    """
+
+    lasers: LaserColumns | None = None
+
+    @property
+    def size(self) -> int:
+        """Unknowns of the path and of the lasers."""
+        return self.path_size + (0 if self.lasers is None else UNKNOWNS)
+
+    def apply(self, vector: Array) -> Array:
+        """The normal matrix of the lidar times a vector, shape (size,)."""
+        path = vector[: self.path_size]
+        if self.lasers is None:
+            return PlaneRows.apply(self, path)
+        lasers, corrections = self.lasers, vector[self.path_size :]
+        return np.concatenate(
+            [
+                PlaneRows.apply(self, path) + corrections @ lasers.border,
+                lasers.border @ path + lasers.corner @ corrections,
+            ]
+        )
+
+    def spread(self, values_m: Array) -> Array:
+        """The columns of all unknowns times values of the rows, shape (n,), weighed and less the best plane of each voxel."""
+        by_path = PlaneRows.spread(self, values_m)
+        if self.lasers is None:
+            return by_path
+        return np.concatenate([by_path, self.lasers.gradient(self.projected(values_m))])
+
+    def along(self, vector: Array) -> Array:
+        """The rows times a vector of unknowns, shape (n,)."""
+        out = PlaneRows.along(self, vector[: self.path_size])
+        return out if self.lasers is None else out + self.lasers.along(vector[self.path_size :])
+
+    def with_lasers(self, laser: npt.NDArray[np.int32], xyz_m: Singles, normal: Array) -> None:
+        """Take the corrections of the lasers in: each row's laser, its cluster and its plane's normal in the sensor frame."""
+        lasers = columns_of(laser, xyz_m, normal)
+        lasers.border, lasers.corner = np.zeros((UNKNOWNS, self.path_size)), np.zeros((UNKNOWNS, UNKNOWNS))
+        border_of(self.arrays, lasers.arrays, lasers.border, lasers.corner)
+        self.lasers = lasers
+
+
+def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool) -> Rows:
+    """Put clusters into voxels where the path places them, find the planes, and linearise.
+
+    Parameters
+    ----------
+    clusters : Clusters
+    path : Path
+    voxel_m : float
+    most : int
+        Rows of a slice; what has more is thinned, planes of rare direction last.
+    cut : bool
+        Whether rows beyond `CUT` sigmas are dropped: not while the path is still rough.
+    """
+    world, rotation, knot, weights = _place_all(clusters, path)
+    voxel, voxels = assign(world, voxel_m)
+    order, first = sorted_by(voxel, voxels)
+    seen = Placed(world, clusters.scatter_m2, clusters.count, knot, np.empty(0, np.int32))
+    planes = VoxelPlanes.empty(voxels)
+    find_planes(first, order, seen, voxel_m, planes)
+    keep = _choose(first, order, knot, planes, path.intervals, most)
+    kept = order[keep]
+    good = np.repeat(np.arange(voxels), np.diff(first))[keep]
+    ids, at = np.unique(good, return_index=True)
+    starts = np.append(at, len(good)).astype(np.int64)
+    n = len(kept)
+    rows = Rows(
+        starts, knot[kept], weights[kept], np.empty((n, 6), np.float32), np.empty((n, 2), np.float32), np.empty(n), np.empty(n),
+        np.empty((len(ids), 6)), kept, path.intervals,
+    )  # fmt: skip
+    normals, variance = planes.normal[ids], np.empty(n)
+    poses = _Poses(rotation, clusters.xyz_m)
+    chosen = VoxelPlanes(normals, planes.mean_m[ids], planes.good[ids])
+    rows.lay(kept, seen, chosen, voxel_m)
+    _linearise(rows.arrays, kept, seen, poses, normals, variance)
+    rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
+    rotation, xyz = rotation[kept], clusters.xyz_m[kept]
+    del world, knot, weights, voxel, order, good, keep, seen, poses, variance  # a hundred bytes a cluster
+    _drop_unobserved(rows, _Poses(rotation, xyz), voxel_m)
+    if clusters.laser is not None:
+        in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
+        rows.with_lasers(clusters.laser[kept], xyz, in_sensor)
+    return rows
+
+
+def placed(clusters: Clusters, path: Path) -> tuple[Array, Singles]:
+    """Where a path places clusters, shape (n, 3), and the matrices "local from sensor" that it does so with, shape (n, 9)."""
+    world, rotation, _, _ = _place_all(clusters, path)
+    return world, rotation
+
+
+class _Located(NamedTuple):
+    """Where a path places clusters.
+
+    Attributes
+    ----------
+    world_m : ndarray, shape (n, 3)
+    rotation : ndarray of float32, shape (n, 9)
+        Local from sensor, row by row.
+    knot : ndarray of int32, shape (n,)
+        Interval of the spline, and its weights there, float32, shape (n, 4).
+    """
+
+    world_m: Array
+    rotation: Singles
+    knot: npt.NDArray[np.int32]
+    weights: Singles
+
+
+def _place_all(clusters: Clusters, path: Path) -> _Located:
+    count = len(clusters)
+    out = _Located(
+        np.empty((count, 3)), np.empty((count, 9), np.float32), np.empty(count, np.int32), np.empty((count, 4), np.float32)
+    )  # fmt: skip
+    _place(clusters.time_ns, clusters.xyz_m, path.arrays, out)
+    return out
+
+
+class _Poses(NamedTuple):
+    """Clusters in the sensor frame, and its attitudes.
+
+    Attributes
+    ----------
+    rotation : ndarray of float32, shape (n, 9)
+        Local from sensor, row by row.
+    xyz_m : ndarray of float32, shape (n, 3)
+    """
+
+    rotation: Singles
+    xyz_m: Singles
+
+
+def _drop_unobserved(rows: Rows, poses: _Poses, voxel_m: float) -> None:
+    """Take out of the rows of each interval the directions that its planes do not show, as the odometry does.
+
+    Judged and taken out on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it,
+    and each change of tilt would seem to tell a little of the heading. Where the heading is not seen at all, tilts count no more than
+    the shape of the path between two knots is known: a gyro's offset about the vertical shows in them by the small part that a body
+    leans, and what is far below that noise would settle it wrongly. The poses are those of the rows' clusters.
+    """
+    normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
+    _sum_ground(rows.knot, rows.jacobian, rows.weight, normals)
+    normals = uniform_filter1d(normals, GROUND_SLICES, axis=0, mode="constant")
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    _level(rows.knot, rows.jacobian, poses, normals, level)
+    blocks = np.zeros((rows.intervals, 6, 6))
+    _blocks(rows.knot, level, rows.weight, blocks)
+    known = np.array([observable(block) if block[3:, 3:].any() else np.eye(6) for block in blocks])
+    affected = np.trace(known, axis1=1, axis2=2) < 5.5
+    _keep_known(rows.arrays, affected, known, level, poses.rotation)
+    blind = affected & (known[:, 2, 2] < 0.5)
+    if blind.any():
+        share = np.ones(rows.intervals)
+        share[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(blocks[blind, :3, :3])[:, 2])
+        rows.weight *= share[rows.knot]
+        rows.replane(voxel_m)
+
+
+@njit(cache=True, nogil=True)
+def _sum_ground(knot: Knots, jacobian: Singles, weight: Array, normals: Array) -> None:
+    """Weighted sum of the ground's normals in each interval, up."""
+    for i in range(len(knot)):
+        if abs(jacobian[i, 5]) > GROUND:
+            signed = weight[i] if jacobian[i, 5] > 0.0 else -weight[i]
+            for c in range(3):
+                normals[knot[i], c] += signed * jacobian[i, 3 + c]
+
+
+@njit(cache=True, nogil=True)
+def _level(knot: Knots, jacobian: Singles, poses: _Poses, normals: Array, out: Singles) -> None:
+    """Rows by rotation about the map's axes and by position, those of ground with the ground's mean normal."""
+    rotation, xyz = poses.rotation, poses.xyz_m
+    for i in range(len(jacobian)):
+        m, j = rotation[i], jacobian[i]
+        if abs(j[5]) > GROUND:
+            side = 1.0 if j[5] > 0.0 else -1.0
+            n = normals[knot[i]]
+            nx, ny, nz = side * n[0], side * n[1], side * n[2]
+            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
+            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
+            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
+            out[i, 0], out[i, 1], out[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+            out[i, 3], out[i, 4], out[i, 5] = nx, ny, nz
+        else:
+            for r in range(3):
+                out[i, r] = m[3 * r] * j[0] + m[3 * r + 1] * j[1] + m[3 * r + 2] * j[2]
+                out[i, 3 + r] = j[3 + r]
+
+
+@njit(cache=True, nogil=True)
+def _keep_known(
+    rows: RowArrays, affected: npt.NDArray[np.bool_], known: Array, level: Singles, rotation: Singles
+) -> None:
+    """Rows of the affected intervals anew: what is known of them, by rotation in the body again."""
+    knot, jacobian = rows.knot, rows.jacobian
+    row = np.empty(6)
+    for i in range(len(knot)):
+        k = knot[i]
+        if not affected[k]:
+            continue
+        row[:] = 0.0
+        for a in range(6):
+            for b in range(6):
+                row[b] += level[i, a] * known[k, a, b]
+        m = rotation[i]
+        for c in range(3):
+            jacobian[i, c] = m[c] * row[0] + m[3 + c] * row[1] + m[6 + c] * row[2]
+            jacobian[i, 3 + c] = row[3 + c]
+
+
+@njit(cache=True, nogil=True)
+def _place(time_ns: Ints, xyz: Singles, path: PathArrays, out: _Located) -> None:
+    quat, position = path.quat, path.position_m
+    world, rotation, knot, weights = out.world_m, out.rotation, out.knot, out.weights
+    m, a, b = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    last = len(quat) - 2
+    intervals = (len(quat) - 1) // STEPS
+    for n in range(len(time_ns)):
+        g = (time_ns[n] - path.start_ns) / path.step_ns
+        i = min(max(int(g), 0), last)
+        u = g - i
+        mat_of_quat(quat[i], a)
+        mat_of_quat(quat[i + 1], b)
+        for r in range(3):
+            for c in range(3):
+                m[r, c] = a[r, c] + u * (b[r, c] - a[r, c])
+                rotation[n, 3 * r + c] = m[r, c]
+            world[n, r] = position[i, r] + u * (position[i + 1, r] - position[i, r])
+        for r in range(3):
+            world[n, r] += m[r, 0] * xyz[n, 0] + m[r, 1] * xyz[n, 1] + m[r, 2] * xyz[n, 2]
+        k = min(max(int(g / STEPS), 0), intervals - 1)
+        knot[n] = k
+        w0, w1, w2, w3 = basis(g / STEPS - k)
+        weights[n, 0], weights[n, 1], weights[n, 2], weights[n, 3] = w0, w1, w2, w3
+
+
+@njit(cache=True, nogil=True)
+def _shares(bins: Ints, most: int) -> Array:
+    """Part of each slice's rows to keep by direction: even numbers, and what one direction does not use goes to the others."""
+    share = np.empty(bins.shape)
+    for k in range(len(bins)):
+        left, open_bins = np.float64(most), 4
+        share[k, :] = -1.0
+        for _ in range(4):
+            level = left / max(open_bins, 1)
+            changed = False
+            for b in range(4):
+                if share[k, b] < 0.0 and bins[k, b] <= level:
+                    share[k, b] = 1.0
+                    left -= bins[k, b]
+                    open_bins -= 1
+                    changed = True
+            if not changed:
+                break
+        for b in range(4):
+            if share[k, b] < 0.0:
+                share[k, b] = left / open_bins / bins[k, b]
+    return share
+
+
+@njit(cache=True, nogil=True)
+def _choose(first: Ints, order: Ints, knot: Knots, planes: VoxelPlanes, intervals: int, most: int) -> Ints:
+    """Positions in `order` of the rows to keep: of planes only, at most `most` of a slice.
+
+    Rows are thinned by the direction of their planes, so that few walls count as much as all the ground.
+    """
+    normals, good = planes.normal, planes.good
+    bins = np.zeros((intervals, 4), np.int64)
+    kind = np.empty(len(good), np.int8)
+    for v in range(len(good)):
+        a, b, c = abs(normals[v, 0]), abs(normals[v, 1]), abs(normals[v, 2])
+        kind[v] = 3 if c > 0.9 else (2 if c > 0.5 else (0 if a > b else 1))
+        if not good[v]:
+            continue
+        for at in range(first[v], first[v + 1]):
+            bins[knot[order[at]], kind[v]] += 1
+    share = _shares(bins, most)
+    keep = np.empty(len(order), np.int64)
+    count = 0
+    for v in range(len(good)):
+        if not good[v]:
+            continue
+        start = count
+        for at in range(first[v], first[v + 1]):
+            p = share[knot[order[at]], kind[v]]
+            # a draw by voxel, the same in every run, so that the voxels kept are seen by many slices
+            if p >= 1.0 or (spread(v * 2654435761) & 0xFFFFF) < p * 0x100000:
+                keep[count] = at
+                count += 1
+        if count - start < 2:
+            count = start
+    return keep[:count]
+
+
+@njit(cache=True, nogil=True)
+def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: _Poses, normals: Array, variance: Array) -> None:
+    """Fill in jacobians of rows, and the variance of each by its returns [m^2].
+
+    `kept` has the cluster of each row, `normals` are those of the voxels that the rows have.
+    """
+    first, jacobian = rows.first, rows.jacobian
+    scatter, counts, rotation, xyz = seen.scatter_m2, seen.returns, poses.rotation, poses.xyz_m
+    for v in range(len(first) - 1):
+        nx, ny, nz = normals[v]
+        for i in range(first[v], first[v + 1]):
+            n = kept[i]
+            r = rotation[n]
+            p = nx * r[0] + ny * r[3] + nz * r[6]
+            q = nx * r[1] + ny * r[4] + nz * r[7]
+            s = nx * r[2] + ny * r[5] + nz * r[8]
+            x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
+            jacobian[i, 0], jacobian[i, 1], jacobian[i, 2] = y * s - z * q, z * p - x * s, x * q - y * p
+            jacobian[i, 3], jacobian[i, 4], jacobian[i, 5] = nx, ny, nz
+            # returns of one cluster spread across the plane more than their noise: two surfaces, or an edge
+            across = scatter_along(scatter[n], nx, ny, nz) / counts[n]
+            variance[i] = max(RANGE_SIGMA_M**2, across) / counts[n]
+
+
+@njit(cache=True, nogil=True)
+def _blocks(knot: Knots, jacobian: Singles, weight: Array, out: Array) -> None:
+    for i in range(len(knot)):
+        k = knot[i]
+        for a in range(6):
+            wa = weight[i] * jacobian[i, a]
+            for b in range(6):
+                out[k, a, b] += wa * jacobian[i, b]

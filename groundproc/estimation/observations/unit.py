@@ -1,0 +1,87 @@
+"""An inertial unit on the grid of a path, with what has been found of its clock and its axes so far."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from groundproc.estimation.observations.rows import H
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.motion import ImuTrack, on_grid
+from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics import robust
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Unit:
+    """An inertial unit with what is estimated of it; its rates and forces are on the path's grid.
+
+    Attributes
+    ----------
+    name : str
+        Prefix of its globals.
+    rate_rad_s, force_m_s2 : ndarray, shape (n STEPS, 3)
+        As measured, in the sensor frame by the nominal mount.
+    known, force_known : ndarray of bool, shape (n STEPS,)
+    values : dict of str to ndarray
+        bias [rad/s], scale, shear, turn [rad], delay [s], accel_bias [m/s^2], accel_turn [rad], lever [m], drift
+        of the delay [s/s]: what has been taken off so far. The delay is that in the middle of the path.
+    sigma_turn_rad, sigma_force_m_s2 : float
+        Noise of an increment over a slice; of the mean force about a knot.
+    """
+
+    name: str
+    rate_rad_s: Array
+    force_m_s2: Array
+    known: npt.NDArray[np.bool_]
+    force_known: npt.NDArray[np.bool_]
+    values: dict[str, Array]
+    sigma_turn_rad: float
+    sigma_force_m_s2: float
+
+    def true_rate(self) -> Array:
+        """Rates with bias, scale and misalignment taken off; the delay is in the grid already."""
+        gain = np.diag(1.0 + self.values["scale"]) + sheared(self.values["shear"])
+        rate = (self.rate_rad_s - self.values["bias"]) @ np.linalg.inv(gain)
+        return np.asarray(rate @ frames.mat_from_quat(frames.quat_exp(self.values["turn"][None]))[0].T)
+
+
+def sheared(shear: Array) -> Array:
+    """Symmetric matrix, shape (3, 3), of what a sensor feels of the two other axes: yz, zx, xy."""
+    yz, zx, xy = shear
+    return np.array([[0.0, xy, zx], [xy, 0.0, yz], [zx, yz, 0.0]])
+
+
+def place_on_grid(unit: Unit, track: ImuTrack, path: Path) -> None:
+    """Rates and forces of a unit on the path's grid, with its delay and what that drifts by taken off the stamps."""
+    steps = path.intervals * STEPS
+    since_middle_ns = track.time_ns - (path.start_ns + steps * STEP_NS // 2)
+    late_ns = 1e9 * float(unit.values["delay"][0]) + float(unit.values["drift"][0]) * since_middle_ns
+    time_ns = track.time_ns - np.rint(late_ns).astype(np.int64)
+    unit.rate_rad_s, unit.known = on_grid(time_ns, track.rate_rad_s, path.start_ns, steps)
+    unit.force_m_s2, unit.force_known = on_grid(time_ns, np.nan_to_num(track.force_m_s2), path.start_ns, steps)
+    if not np.isfinite(track.force_m_s2).all():
+        unit.force_known[:] = False
+
+
+def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array) -> Unit:
+    """A unit with nothing estimated yet but its gyro's bias."""
+    values = {
+        "bias": bias.copy(), "scale": np.zeros(3), "shear": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1),
+        "drift": np.zeros(1),        "accel_bias": np.zeros(3), "accel_turn": np.zeros(3), "lever": lever.copy(),
+    }  # fmt: skip
+    none = np.zeros((0, 3))
+    unit = Unit(
+        name, none, none, np.zeros(0, np.bool_), np.zeros(0, np.bool_), values, track.rate_density() * np.sqrt(H),
+        track.force_density() * np.sqrt(2.0 / 3.0 / H),
+    )  # fmt: skip
+    place_on_grid(unit, track, path)
+    return unit
+
+
+def robust_sigma(residual: Array, least: float) -> float:
+    """Standard deviation from the median absolute deviation."""
+    return max(robust.sigma(residual, np.median(residual, axis=0)), least) if len(residual) else least

@@ -1,0 +1,250 @@
+"""Drives the odometry slice by slice, over a recording or while the flight goes on: start, silent slices, fixes, loss of way."""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from flightlog.errors import LogError
+from groundproc.estimation.odometry.bearing import Bearing
+from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
+from groundproc.estimation.odometry.history import History
+from groundproc.estimation.odometry.motion import MotionGrid
+from groundproc.estimation.odometry.odometry import Odometry, Step
+from groundproc.estimation.odometry.slices import Slice
+from groundproc.estimation.odometry.start import RoughPoses, state_at
+from groundproc.estimation.odometry.state import State
+from groundproc.estimation.odometry.stated import Fix, Stated
+from groundproc.estimation.odometry.track import KEPT, NO_CLUSTERS, Track, thinned
+from groundproc.estimation.odometry.voxels import PlaneMap
+
+Array = npt.NDArray[np.float64]
+
+VOXELS_M: Final = (0.5, 1.0, 2.0)
+"""Edges of the odometry's voxels; rings on the ground lie wider apart the higher one flies, and a voxel must see more than one."""
+WIDE_AT_M: Final = (28.0, 60.0)
+"""Median range from which on the second and the third are taken."""
+LOST_M: Final = 15.0
+LOST_SIGMAS: Final = 6.0
+LOST_FIXES: Final = 8
+"""So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew."""
+FIX_TAU_S: Final = 1.0
+"""The filter takes positions as if their errors lasted so long: light beside the lidar, and firm enough to hold it where there is none."""
+RECENT_S: Final = 0.5
+"""A position not older than this is carried on to now by the velocity; an older one is compared with where the path was."""
+RECENT_ATTITUDE_S: Final = 0.2
+ATTITUDE_EVERY_NS: Final = 1_000_000_000
+ATTITUDE_FIX_RAD: Final = np.deg2rad([3.0, 3.0, 30.0])
+"""The autopilot's attitude is taken once a second with these sigmas, about east, north and up; light in the same way."""
+FEWEST: Final = 20
+"""Slices that make a track."""
+
+
+class Tracker:
+    """The odometry with what keeps it going: start, silent slices, what the autopilot states, loss of way.
+
+    The causal method and the live view drive the same object; what differs between them is behind `MotionGrid`, `RoughPoses` and
+    `Stated`.
+
+    Parameters
+    ----------
+    motion : MotionGrid
+    rough : RoughPoses
+        To begin from.
+    mat_ins_lidar, lever_m : ndarray, shape (3, 3), (3,)
+        Nominal mount.
+    gyro_bias : ndarray, shape (3,)
+        Where to begin [rad/s].
+    stated : Stated
+    keep : bool
+        Whether clusters are kept for the batch.
+    """
+
+    def __init__(
+        self, motion: MotionGrid, rough: RoughPoses, mat_ins_lidar: Array, lever_m: Array, gyro_bias: Array,
+        stated: Stated, keep: bool = True,
+    ) -> None:  # fmt: skip
+        self.motion, self._rough, self._mat, self._lever = motion, rough, mat_ins_lidar, lever_m
+        self._bias, self._stated, self._keep = gyro_bias, stated, keep
+        self.odometry: Odometry | None = None
+        self.track: Track | None = None
+        self._far, self._next_attitude_ns = 0, 0
+        self._range_m = 0.0
+        self._bearing = Bearing(np.zeros(3))
+        self._history, self._begin_ns = History(), 0
+
+    def feed(self, piece: Slice) -> Step | None:
+        """Take the next slice; None before the start, and where the inertial data have ended."""
+        if self.odometry is None and not self._begin(piece):
+            return None
+        odometry = self.odometry
+        assert odometry is not None
+        if piece.number < odometry.number or (piece.number + 1) * STEPS > len(self.motion):
+            return None
+        while odometry.number < piece.number:  # nothing was seen
+            odometry.propagate(odometry.number)
+            self._take_stated(odometry)
+            self._note(odometry, None)
+        if len(piece.xyz_m):
+            self._follow_range(odometry, piece)
+        step = odometry.step(piece)
+        self._take_stated(odometry)
+        self._note(odometry, step)
+        return step
+
+    def gyro_bias(self) -> Array:
+        """The bias as known by now [rad/s], shape (3,)."""
+        return self._bias if self.track is None or not self.track.gyro_bias else self.track.gyro_bias[-1]
+
+    def forget(self, slices: int) -> None:
+        """The grid of motion begins that many slices later: the numbers of slices count from there."""
+        if self.odometry is not None and self.track is not None:
+            self.odometry.number -= slices
+            self.track.first -= slices
+
+    def _begin(self, piece: Slice) -> bool:
+        state = self._state_at(piece.number)
+        if state is None:
+            return False
+        self._range_m = _median_range(piece)
+        voxel_m = _edge(self._range_m)
+        self.odometry = Odometry(state, self.motion, piece.number, voxel_m)
+        self.track = Track(piece.number, [state.quat.copy()], [state.position_m.copy()], voxel_m=voxel_m)
+        self._set_out(state, piece.number)
+        return True
+
+    def _set_out(self, state: State, number: int) -> None:
+        """A new map begins here, with the bearing of its first attitude."""
+        self._begin_ns = self.motion.start_ns + number * SLICE_NS
+        self._bearing = Bearing(state.position_m.copy())
+        self._history.clear()
+        self._history.add(self._begin_ns, state.position_m.copy(), state.quat.copy())
+        self._far = 0
+
+    def _follow_range(self, odometry: Odometry, piece: Slice) -> None:
+        """Wider voxels as the ranges grow, and narrower ones again; what the map holds is taken along."""
+        assert self.track is not None
+        self._range_m += 0.05 * (_median_range(piece) - self._range_m)
+        voxel_m = _edge(self._range_m, odometry.voxel_m)
+        if voxel_m != odometry.voxel_m:
+            odometry.change_voxels(voxel_m)
+            self.track.voxel_m = voxel_m
+
+    def _note(self, odometry: Odometry, step: Step | None) -> None:
+        track, state = self.track, odometry.state
+        assert track is not None
+        track.quat.append(state.quat.copy())
+        track.position_m.append(state.position_m.copy())
+        track.velocity_m_s.append(state.velocity_m_s.copy())
+        track.gyro_bias.append(state.gyro_bias_rad_s.copy())
+        track.sigma.append(np.sqrt(np.diag(state.covariance)[:6]))
+        track.matched.append(0 if step is None else step.matched)
+        track.seen.append(0 if step is None else step.seen)
+        track.residual_m.append(float("nan") if step is None else step.residual_m)
+        if step is None or not self._keep:
+            track.clusters.append(NO_CLUSTERS)
+        else:
+            track.clusters.append(thinned(step.clusters, step.world_m, odometry.map, KEPT))
+        now_ns = self._now_ns(odometry)
+        if now_ns > self._begin_ns:
+            self._history.add(now_ns, track.position_m[-1], track.quat[-1])
+
+    # What the autopilot states --------------------------------------------------------------------------------------
+
+    def _now_ns(self, odometry: Odometry) -> int:
+        return self.motion.start_ns + odometry.number * SLICE_NS
+
+    def _take_stated(self, odometry: Odometry) -> None:
+        now_ns = self._now_ns(odometry)
+        if now_ns >= self._next_attitude_ns:
+            found = self._stated.attitude(now_ns)
+            if found is not None:
+                self._take_attitude(odometry, now_ns, *found)
+        for fix in self._stated.fixes(now_ns):
+            self._take_fix(odometry, now_ns, fix)
+
+    def _take_attitude(self, odometry: Odometry, now_ns: int, time_ns: int, quat_local_ins_wxyz: Array) -> None:
+        """An attitude, turned on by what the sensor has turned since its time."""
+        age_s = (now_ns - time_ns) * 1e-9
+        if age_s <= RECENT_ATTITUDE_S:
+            last = slice(max(odometry.number * STEPS - STEPS, 0), odometry.number * STEPS)
+            turn = age_s * (self.motion.rate_rad_s[last].mean(axis=0) - odometry.state.gyro_bias_rad_s)
+            since = frames.mat_from_quat(frames.quat_exp(turn[None]))[0]
+        else:
+            was = self._history.at(time_ns)
+            if was is None:
+                return
+            since = was.mat_map_sensor.T @ frames.mat_from_quat(odometry.state.quat[None])[0]
+        mat = frames.mat_from_quat(quat_local_ins_wxyz[None])[0] @ self._mat @ since
+        odometry.attitude_fix(frames.quat_from_mat(mat[None])[0], ATTITUDE_FIX_RAD)
+        self._next_attitude_ns = now_ns + ATTITUDE_EVERY_NS
+
+    def _take_fix(self, odometry: Odometry, now_ns: int, fix: Fix) -> None:
+        """A position: what it is off by at its time is taken now.
+
+        Its error lasts, so each counts for little, and only where the lidar cannot tell.
+        """
+        assert self.track is not None
+        state, age_s = odometry.state, (now_ns - fix.time_ns) * 1e-9
+        if age_s <= RECENT_S:
+            way = state.position_m
+            mat = frames.mat_from_quat(state.quat[None])[0]
+            place = fix.position_m + age_s * state.velocity_m_s - mat @ self._stated.lever_m
+        else:
+            was = self._history.at(fix.time_ns)
+            if was is None:
+                self.track.late_fixes += fix.time_ns >= self._begin_ns
+                return
+            way, place = was.position_m, fix.position_m - was.mat_map_sensor @ self._stated.lever_m
+        off = self._bearing.on_map(way, place, float(fix.sigma_m[:2].mean())) - way
+        self.track.fixes += 1
+        self._far = self._far + 1 if (np.abs(off) > np.maximum(LOST_M, LOST_SIGMAS * fix.sigma_m)).any() else 0
+        sigma_m = fix.sigma_m * np.sqrt(max(2.0 * FIX_TAU_S * fix.rate_hz, 1.0))
+        before = state.position_m.copy()
+        odometry.position_fix(before + off, sigma_m)
+        self._history.shift(state.position_m - before)
+        if self._far >= LOST_FIXES:
+            self._restart(odometry)
+
+    def _restart(self, odometry: Odometry) -> None:
+        """The odometry has lost its way: begin anew from a rough pose, with a new map."""
+        assert self.track is not None
+        state = self._state_at(odometry.number)
+        if state is not None:
+            odometry.state, odometry.map = state, PlaneMap(odometry.voxel_m)
+            self.track.restarts += 1
+            self._set_out(state, odometry.number)
+
+    def _state_at(self, number: int) -> State | None:
+        return state_at(number, self.motion, self._rough, self._mat, self._lever, self.gyro_bias())
+
+
+def _median_range(piece: Slice) -> float:
+    """Median range of a slice's returns [m]; a sixteenth of them will do."""
+    return float(np.median(np.linalg.norm(piece.xyz_m[::16], axis=1))) if len(piece.xyz_m) else 0.0
+
+
+def _edge(range_m: float, now_m: float = 0.0) -> float:
+    """Edge of the voxels for a median range; one in use is kept until the range is 15 % past the border."""
+    for edge, border in zip(VOXELS_M, (*WIDE_AT_M, np.inf), strict=True):
+        if range_m < border * (1.0 if now_m == 0.0 else (1.15 if now_m <= edge else 0.85)):
+            return edge
+    return VOXELS_M[-1]
+
+
+def tracked(tracker: Tracker) -> Track:
+    """The track, when all slices are fed.
+
+    Raises
+    ------
+    LogError
+        Not enough of them could be placed.
+    """
+    track = tracker.track
+    if track is None or len(track) < FEWEST:
+        raise LogError(
+            f"adjusted: {0 if track is None else len(track)} tenths of a second with lidar, inertial data and position together, "
+            f"expected {FEWEST} or more"
+        )
+    return track

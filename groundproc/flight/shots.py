@@ -1,0 +1,103 @@
+"""The shots of a flight in UTC, piece by piece, and what became of the lidar's packets on the way."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flightlog.logfile import LogReader
+from groundproc.flight import load
+from groundproc.flight.lidar import lidar_of
+from groundproc.flight.load import LidarBatch, Progress
+from groundproc.flight.timeline import Leg
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import Gate, LaserTable, Shots
+
+_SLACK_NS = 10**9
+"""A batch belongs to a leg up to so long before and after the leg was received."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What became of the lidar's packets."""
+
+    packets: int = 0
+    masked_packets: int = 0
+    masked_blocks: int = 0
+    kernel_drops: int = 0
+    queue_drops: int = 0
+    rejected: int = 0
+    packets_without_leg: int = 0
+
+    def add(self, batch: LidarBatch) -> None:
+        """Add up what became of the packets before they reached the log."""
+        self.packets += len(batch.packets)
+        if batch.account is not None:
+            self.masked_packets += batch.account.masked_packets
+            self.masked_blocks += batch.account.masked_blocks
+            self.kernel_drops += batch.account.kernel_drops
+            self.queue_drops += batch.account.queue_drops
+            self.rejected += (
+                batch.account.rejected_length + batch.account.rejected_content + batch.account.rejected_sender
+            )
+
+
+def shots(
+    readers: Sequence[LogReader],
+    timeline: Sequence[Leg],
+    gate: Gate,
+    lasers: LaserTable | None = None,
+    tally: Tally | None = None,
+    progress: Progress | None = None,
+) -> Iterator[Shots]:
+    """Stream the shots of a flight, about a second at a time; each piece is of one leg and one return mode.
+
+    Parameters
+    ----------
+    readers : sequence of LogReader
+        The flight's logs.
+    timeline : sequence of Leg
+        Each with a line from lidar time to UTC; packets outside all of them are counted and left out.
+    gate : Gate
+    lasers : LaserTable, optional
+        Default: the manual's.
+    tally : Tally, optional
+        Is added to.
+    progress : callable, optional
+        Called with the number of file bytes done since the last call.
+    """
+    lidar, tally = lidar_of(readers), tally or Tally()
+    for batches in _pieces(load.lidar_batches(readers, progress, lidar), lidar, tally):
+        packets = load.joined([batch.packets for batch in batches])
+        leg = _leg_of(int(batches[0].receive_time_ns[0]), timeline)
+        if leg is None:
+            tally.packets_without_leg += len(packets)
+            continue
+        device_ns = np.concatenate([batch.device_time_ns for batch in batches])
+        yield from lidar.decode(packets, leg.utc_from_lidar(device_ns), gate, lasers)
+
+
+def _pieces(batches: Iterator[LidarBatch], lidar: Lidar, tally: Tally) -> Iterator[list[LidarBatch]]:
+    """Batches that may be decoded as one, about a second together: that bounds the memory, and both cores can compress it."""
+    waiting: list[LidarBatch] = []
+    size = 0
+    for batch in batches:
+        tally.add(batch)
+        if not len(batch.packets):
+            continue
+        new = bool(waiting) and (batch.jumped or not lidar.same_kind(waiting[-1].packets, batch.packets))
+        if waiting and (size >= lidar.records_s or new):
+            yield waiting
+            waiting, size = [], 0
+        waiting.append(batch)
+        size += len(batch.packets)
+    if waiting:
+        yield waiting
+
+
+def _leg_of(receive_ns: int, timeline: Sequence[Leg]) -> Leg | None:
+    """The leg in which something was received at a time [ns of log time]."""
+    return next(
+        (leg for leg in timeline if leg.first_receive_ns - _SLACK_NS <= receive_ns <= leg.last_receive_ns + _SLACK_NS),
+        None,
+    )

@@ -1,0 +1,112 @@
+"""Step place: every shot given its time and pose, projected, and handed to the products."""
+
+import contextlib
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Final
+
+from groundproc import geodesy
+from groundproc.cloud import placing
+from groundproc.flight.lidar import lidar_of
+from groundproc.flight.shots import Tally, shots
+from groundproc.flight.timeline import tied
+from groundproc.geodesy import LocalFrame
+from groundproc.products import chosen, plain
+from groundproc.products.product import Context, Making, streamed
+from groundproc.sensors.model import Lidar
+from groundproc.sensors.shots import Gate
+from groundproc.steps.ledger import INSIDE
+from groundproc.steps.request import Request
+from groundproc.steps.run import Run
+from groundproc.steps.step import WHOLE, Folders, Step
+from groundproc.survey import PlacingSettings, Survey, section
+
+FOUND: Final = f"{INSIDE}/place.json"
+"""What quality.json says of shots and points."""
+
+
+def settings(request: Request) -> Mapping[str, Any]:
+    """The window of shots, the CRS, and what heights refer to."""
+    survey = request.survey
+    return section(survey, PlacingSettings) | {"crs": survey.crs, "height": survey.height}
+
+
+def parts(request: Request) -> Mapping[str, Any]:
+    """What became of the shots, and each product that takes points: one more costs a pass, and those that are there stay."""
+    return {WHOLE: {}} | {each.name: plain([each]) for each in chosen(request.survey.products) if each.takes_points}
+
+
+def check(request: Request) -> None:
+    """Refuse a wrong code and a product that there is not before the work, not after."""
+    chosen(request.survey.products)
+    if request.survey.crs is not None:
+        geodesy.projected_crs(request.survey.crs)
+
+
+def projection_of(frame: LocalFrame, survey: Survey) -> geodesy.Projection:
+    """Into the survey's CRS, or the UTM zone of the frame's origin."""
+    code = survey.crs or geodesy.utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    return geodesy.Projection(frame, geodesy.projected_crs(code))
+
+
+def work(run: Run, folders: Folders) -> None:
+    """Place the points and finish the products that are made of them."""
+    made = run.estimate
+    timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
+    projection = projection_of(made.trajectory.frame, run.survey)
+    survey, tally = run.survey, Tally()
+    context = Context(run.folder, run.folder, survey, made, projection, inputs=run.names)
+    lidar = lidar_of(run.readers)
+    gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
+    lasers, told = made.corrections.table(lidar.lasers), functools.partial(run.progress, "place")
+    seen = shots(run.readers, timeline, gate, lasers, tally, told)
+    with contextlib.ExitStack() as stack:
+        sinks: list[Making] = []
+        for each in chosen(survey.products):
+            if each.name in folders:
+                own = replace(context, folder=folders[each.name])
+                sinks += stack.enter_context(streamed([each], own))
+        placed = placing.place(seen, made.trajectory, made.mount, projection, sinks)
+    if WHOLE in folders:
+        _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed)
+
+
+def _tell(path: Path, lidar: Lidar, projection: geodesy.Projection, tally: Tally, placed: placing.Placed) -> None:
+    """Write what became of the shots."""
+    found = {
+        "crs": {"epsg": projection.crs.to_epsg(), "name": projection.crs.name},
+        "lidar": {
+            "model": lidar.name,
+            "packets": tally.packets,
+            "packets_outside_every_leg": tally.packets_without_leg,
+            "aboard": {
+                "masked_packets": tally.masked_packets,
+                "masked_blocks": tally.masked_blocks,
+                "kernel_drops": tally.kernel_drops,
+                "queue_drops": tally.queue_drops,
+                "rejected": tally.rejected,
+            },
+        },
+        "points": {
+            "written": placed.points,
+            "range_step_m": lidar.range_step_m,
+            "shots_dropped": asdict(placed.dropped),
+        },
+    }
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+STEP: Final = Step(
+    name="place",
+    about="points, and the products made of them",
+    after=("trajectory",),
+    reads_logs=True,
+    settings=settings,
+    work=work,
+    check=check,
+    parts=parts,
+)

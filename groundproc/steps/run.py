@@ -1,0 +1,95 @@
+"""What the steps of one run share: the logs, opened once, and the flight in them, read when a step first asks for it."""
+
+import contextlib
+import functools
+import itertools
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from flightlog.errors import UsageError
+from flightlog.logfile import LogReader
+from flightlog.mount import Mount
+from groundproc.estimation.method import Progress
+from groundproc.flight.flight import Flight, read_flight
+from groundproc.flight.mounting import find_mount
+from groundproc.flight.timeline import Leg, legs
+from groundproc.steps.request import Request
+from groundproc.survey import Survey
+from groundproc.trajectory.estimate import Estimate, read_estimate
+
+
+class Run:
+    """One run of some steps.
+
+    Parameters
+    ----------
+    request : Request
+    folder : Path
+        Where the outputs of finished steps lie.
+    progress : Progress
+    """
+
+    def __init__(self, request: Request, folder: Path, progress: Progress) -> None:
+        self.request = request
+        self.folder = folder
+        self.progress = progress
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    @property
+    def survey(self) -> Survey:
+        """What the user chose."""
+        return self.request.survey
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the logs."""
+        return tuple(path.name for path in self.request.logs)
+
+    @cached_property
+    def readers(self) -> Sequence[LogReader]:
+        """The logs, in order of time."""
+        readers = [self._stack.enter_context(LogReader(path)) for path in self.request.logs]
+        check_order(readers)
+        return readers
+
+    @cached_property
+    def mount_and_source(self) -> tuple[Mount, str]:
+        """The nominal mount, and where it comes from."""
+        return find_mount(self.survey.mount, self.readers)
+
+    @cached_property
+    def flight(self) -> Flight:
+        """Autopilot, gyros and clocks of the flight."""
+        return read_flight(self.readers, "ins", functools.partial(self.progress, "read"))
+
+    @cached_property
+    def timeline(self) -> Sequence[Leg]:
+        """The flight's clocks on one scale."""
+        mount, _ = self.mount_and_source
+        return legs(self.flight.runs, self.flight.boots, mount.mat_ins_lidar(), self.survey.sync)
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """What step trajectory left, read from its files: a run that goes on places the points with the same as one that never stopped."""
+        return read_estimate(self.folder)
+
+
+def check_order(readers: list[LogReader]) -> None:
+    """Sort logs by time; logs that overlap are not of one flight."""
+    readers.sort(key=lambda reader: reader.start_ns)
+    for before, after in itertools.pairwise(readers):
+        if after.start_ns < before.end_ns - 1_000_000_000:
+            raise UsageError(
+                f"{before.path} and {after.path}: overlap in time; the parts of one flight follow each other"
+            )

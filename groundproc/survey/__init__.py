@@ -1,0 +1,203 @@
+"""survey.yaml: what a user chooses about a survey. One dataclass a step, all of them together in `Survey`.
+
+The keys of the file are flat. On the command line the options have the names that stand here beside them.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from flightlog import config
+from flightlog.mount import Mount
+from groundproc.survey.dynamic import DynamicOptions
+from groundproc.survey.methods import METHODS
+from groundproc.survey.setting import sample_lines, setting
+
+HEIGHTS: Final = ("msl", "ellipsoid", "relative")
+BESIDE: Final = "a file looked for beside this one"
+
+
+@dataclass(frozen=True)
+class MountSettings:
+    """Mount: how the lidar sits on the airframe."""
+
+    mount: Mount | str | None = setting(
+        None,
+        "how the lidar sits on the airframe: a mount file",
+        words=("--mount",),
+        metavar="FILE",
+        reads="file",
+        absent="as the log has it",
+        in_file="looked for beside this one, or what stands in it (lidar: position_m, yaw_deg, ...)",
+    )
+
+
+@dataclass(frozen=True)
+class ClockSettings:
+    """Clocks: how lidar and autopilot are put on one time scale."""
+
+    sync: str = setting(
+        "auto",
+        "how the clocks are tied: by the gyros, by receive times (host), or by receive times where the gyros cannot tell (auto)",
+        words=("--sync",),
+        choices=("auto", "gyro", "host"),
+    )
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """Trajectory: how the poses are estimated, and from what beside the log."""
+
+    method: str = setting(
+        "best",
+        "how the trajectory is made; best: adjusted, or filtered or ins where the log does not hold what that needs",
+        words=("--method",),
+        choices=("best", *METHODS),
+    )
+    causal: bool = setting(False, "method adjusted: use nothing of the future, as in flight", words=("--causal",))
+    positions: str | None = setting(
+        None,
+        "methods adjusted and filtered: a better GNSS solution or poses (RTKLIB .pos, SBET, NMEA, trajectory.csv)",
+        words=("--positions",),
+        metavar="FILE",
+        reads="file",
+        absent="none",
+        in_file=BESIDE,
+    )
+    control: str | None = setting(
+        None,
+        "method adjusted: control points and planes (CSV: x, y, z, sigma; name, use, nx, ny, nz, radius) in coordinates and heights of "
+        "the output",
+        words=("--control",),
+        metavar="CSV",
+        reads="file",
+        absent="none",
+        in_file=BESIDE,
+    )
+    lasers: str | None = setting(
+        None,
+        "corrections of the single lasers: a file from `swath calibrate --lasers`; or estimate, to have method adjusted find them on "
+        "this flight",
+        words=("--lasers",),
+        metavar="FILE",
+        reads="file",
+        absent="the manual's table",
+        in_file=BESIDE,
+    )
+    compass: str | None = setting(
+        None,
+        "method dynamic: a compass model to begin with, from `swath calibrate` or `swath compass`",
+        words=("--compass",),
+        metavar="FILE",
+        reads="file",
+        absent="none",
+        in_file=BESIDE,
+    )
+    pose_grid_ms: float | None = setting(
+        None,
+        "method ins: one pose for so many milliseconds, as the source did with 10",
+        words=("--pose-grid",),
+        metavar="MS",
+        reads="milliseconds",
+        absent="a pose for every firing",
+        minimum=1,
+        maximum=1000,
+    )
+    dynamic: DynamicOptions = setting(
+        DynamicOptions, "method dynamic: trims of the trajectory, once per revolution of the scanner"
+    )
+
+
+@dataclass(frozen=True)
+class PlacingSettings:
+    """Points: which returns are used, for the cloud and for the trajectory that is estimated from them."""
+
+    fov_deg: tuple[float, float] = setting(
+        (255.0, 105.0),
+        "azimuths kept, clockwise from first to second, in degrees; 0 and 360 keep all",
+        words=("--fov",),
+        metavar="A-B",
+        reads="azimuths",
+        minimum=-360,
+        maximum=360,
+    )
+    min_range_m: float = setting(
+        1.0, "nearer returns are dropped [m]", words=("--min-range",), metavar="M", minimum=0, maximum=131
+    )
+    max_range_m: float = setting(
+        100.0, "farther returns are dropped [m]", words=("--max-range",), metavar="M", minimum=0, maximum=131.07
+    )
+
+    def __post_init__(self) -> None:
+        if self.min_range_m > self.max_range_m:
+            raise ValueError(f"min_range_m {self.min_range_m} is beyond max_range_m {self.max_range_m}")
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """Output: which products, and their coordinates and heights."""
+
+    crs: int | str | None = setting(
+        None,
+        "EPSG code of the output (32633 or EPSG:32633), projected and in metres",
+        words=("--crs", "--epsg"),
+        metavar="EPSG",
+        absent="UTM zone of the first fix",
+    )
+    height: str = setting("msl", "what heights refer to", words=("--height",), choices=HEIGHTS)
+    geoid: float | str | None = setting(
+        None,
+        "for height ellipsoid, where the autopilot does not state both heights: the geoid's height above the ellipsoid there [m], or a "
+        "grid file that PROJ reads (.gtx, .tif)",
+        words=("--geoid",),
+        metavar="N",
+        absent="none",
+    )
+    products: tuple[Any, ...] | None = setting(
+        None,
+        "what is made beside trajectory.csv and quality.json, by name: cloud.laz,pictures",
+        words=("--products",),
+        metavar="NAMES",
+        reads="names",
+        absent="all of docs/products.md that are made by default",
+        in_file="a list; a name with options of its own is a mapping: [cloud.laz, {NAME: {OPTION: VALUE}}]",
+    )
+
+
+@dataclass(frozen=True)
+class Survey(OutputSettings, PlacingSettings, TrajectorySettings, ClockSettings, MountSettings):
+    """All that can be chosen: the options of `swath process`."""
+
+
+SECTIONS: Final = (MountSettings, ClockSettings, TrajectorySettings, PlacingSettings, OutputSettings)
+"""In the order of the flight from log to products."""
+FILES: Final = ("mount", "positions", "control", "lasers", "compass")
+"""Options that name a file, looked for beside survey.yaml."""
+
+
+def section(survey: Survey, *chosen: type[Any]) -> dict[str, Any]:
+    """The settings of some sections as plain values by name."""
+    names = [field.name for part in chosen for field in dataclasses.fields(part)]
+    return {name: config.to_mapping(getattr(survey, name)) for name in names}
+
+
+def sample(survey: Survey, notes: Mapping[str, Sequence[str]], head: str = "") -> str:
+    """A commented survey.yaml.
+
+    Parameters
+    ----------
+    survey : Survey
+        Values to write.
+    notes : mapping of str to sequence of str
+        What this flight has to do with an option, by its name.
+    head : str
+        Lines of comment above all.
+    """
+    lines = [f"# {line}".rstrip() for line in head.splitlines()]
+    for part in SECTIONS:
+        assert part.__doc__ is not None
+        lines += ["", f"# --- {part.__doc__.splitlines()[0]}"]
+        for field in dataclasses.fields(part):
+            lines += sample_lines(survey, field, notes.get(field.name, ()))
+    return "\n".join(lines).lstrip("\n") + "\n"

@@ -1,0 +1,151 @@
+"""The folder of `swath process` gives the same cloud again: mount, lasers, clock and covariance lie beside the trajectory."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from groundproc.cli import main
+from groundproc.trajectory.estimate import read_estimate
+
+Array = npt.NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def flight(simulated: Callable[..., Any]) -> Any:
+    """A boresight that is off by up to a degree, as a lever arm and the lasers are."""
+    from simulator.plans import plan
+
+    return simulated("adjusted_flight", "village", 20.0, plan("survey_fast_gyro").options, seed=11, points=True)
+
+
+@pytest.fixture(scope="module")
+def direct(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of a run that estimates all there is: mount and lasers too."""
+    return processed(
+        flight.log, tmp_path_factory.mktemp("direct") / "out", "--method", "adjusted", "--lasers", "estimate"
+    )
+
+
+def processed(log: Path, folder: Path, *words: Any) -> Path:
+    assert main(["process", str(log), *(str(word) for word in words), "-o", str(folder)]) == 0
+    return folder
+
+
+def points(folder: Path) -> Array:
+    cloud = laspy.read(folder / "cloud.laz")
+    return np.stack([np.asarray(cloud.x), np.asarray(cloud.y), np.asarray(cloud.z)], axis=1)
+
+
+def quality(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "quality.json").read_text())
+    return content
+
+
+def test_the_cloud_of_the_folder_is_the_cloud(
+    flight: Any, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """To the last bit; and the folder that this makes is as good as the first."""
+    again = processed(flight.log, tmp_path / "out", "--trajectory", direct / "trajectory.csv")
+    said = capsys.readouterr().out
+    assert "mount estimated by adjusted, begun from log" in said
+    for name in ("cloud.laz", "trajectory.npz", "mount.yaml", "lasers.yaml", "ties.yaml"):
+        assert (again / name).read_bytes() == (direct / name).read_bytes(), name
+    assert quality(again)["trajectory"]["method"] == "adjusted"
+    assert str(direct) in quality(again)["trajectory"]["note"]
+
+
+def test_which_mount_was_used_and_that_it_was_estimated_is_said(direct: Path) -> None:
+    mount = quality(direct)["mount"]
+    assert mount["source"] == "estimated by adjusted, begun from log"
+    # what is in the report is what the points were placed with, and not what the log has
+    used = read_estimate(direct).mount
+    assert mount["lidar"]["yaw_deg"] == used.lidar.yaw_deg
+    change = quality(direct)["adjusted"]["mount_change"]["yaw_pitch_roll_deg"]
+    assert np.abs(change).max() > 0.1
+    assert len(mount["sigma"]["turn_deg"]) == len(mount["sigma"]["position_m"]) == 3
+    assert 0.0 < max(mount["sigma"]["turn_deg"]) < 1.0
+
+
+def test_rows_that_were_changed_are_placed_to_a_millimetre(flight: Any, direct: Path, tmp_path: Path) -> None:
+    """An empty line makes it another file: its decimals are then all there is of the poses."""
+    folder = tmp_path / "changed"
+    shutil.copytree(direct, folder)
+    with (folder / "trajectory.csv").open("a") as file:
+        file.write("\n")
+    again = processed(flight.log, tmp_path / "out", "--trajectory", folder)
+    moved = np.linalg.norm(points(again) - points(direct), axis=1)
+    assert np.median(moved) < 0.0005
+    # 0.1 mm of the row, 5e-6 deg at 100 m, and the cloud's own millimetre in three axes
+    assert moved.max() < 0.0025
+    assert "was changed" in quality(again)["trajectory"]["note"]
+
+
+def test_a_trajectory_that_lies_alone_is_taken_with_the_mount_of_the_log_and_that_is_said(
+    flight: Any, direct: Path, tmp_path: Path
+) -> None:
+    """What the folder is for: without it points move by decimetres."""
+    shutil.copy(direct / "trajectory.csv", tmp_path / "trajectory.csv")
+    alone = processed(flight.log, tmp_path / "out", "--trajectory", tmp_path / "trajectory.csv")
+    moved = np.linalg.norm(points(alone) - points(direct), axis=1)
+    assert np.median(moved) > 0.02
+    assert quality(alone)["mount"]["source"] == "log"
+    assert quality(alone)["mount"]["sigma"] is None
+    assert "lies alone" in quality(alone)["trajectory"]["note"]
+
+
+def test_clock_and_lasers_are_those_of_the_folder(flight: Any, direct: Path, tmp_path: Path) -> None:
+    """A clock that is 20 ms late gives the same points later stamps; ranges that are 0.3 m too long move them by that."""
+    folder = tmp_path / "changed"
+    shutil.copytree(direct, folder)
+    ties = folder / "ties.yaml"
+    offset_ns = read_estimate(direct).ties[0].lines[-1].offset_ns
+    text = ties.read_text()
+    assert text.count(str(offset_ns)) == 1
+    ties.write_text(text.replace(str(offset_ns), str(offset_ns + 20_000_000)))
+    (folder / "lasers.yaml").write_text("range_m: [" + ", ".join(["0.3"] * 32) + "]\n")
+    late = processed(flight.log, tmp_path / "late", "--trajectory", folder)
+    new_s, old_s = (np.asarray(laspy.read(each / "cloud.laz").gps_time) for each in (late, direct))
+    new_s = new_s - 0.02
+    # all but the shots at the ends of the trajectory are in both clouds; stamps are right to 0.1 us
+    both = max(new_s[0], old_s[0]) - 1e-6, min(new_s[-1], old_s[-1]) + 1e-6
+    new, old = ((stamps > both[0]) & (stamps < both[1]) for stamps in (new_s, old_s))
+    np.testing.assert_allclose(new_s[new], old_s[old], atol=1e-6)
+    assert new.mean() > 0.99
+    moved = np.linalg.norm(points(late)[new] - points(direct)[old], axis=1)
+    # in 20 ms the aircraft flies 0.1 m and turns by a few tenths of a degree
+    assert 0.2 < np.median(moved) < 0.5
+
+
+def test_the_sigmas_are_the_roots_of_the_written_covariances(direct: Path) -> None:
+    with np.load(direct / "covariance.npz") as held:
+        time_ns, covariance = held["time_ns"], held["covariance"]
+    table = np.genfromtxt(direct / "trajectory.csv", delimiter=",", names=True, dtype=None)
+    rows = np.searchsorted(table["utc_ns"], time_ns)
+    assert (table["utc_ns"][rows] == time_ns).all()
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    for column, name in enumerate(("east", "north", "up")):
+        np.testing.assert_allclose(sigma[:, column], table[f"sigma_{name}_m"][rows], atol=6e-5)
+    for column, name in enumerate(("roll", "pitch", "heading"), 3):
+        np.testing.assert_allclose(np.rad2deg(sigma[:, column]), table[f"sigma_{name}_deg"][rows], atol=6e-5)
+    assert np.diff(time_ns).max() == 100_000_000
+    assert np.linalg.eigvalsh(covariance / (sigma[:, :, None] * sigma[:, None, :])).min() > -1e-9
+
+
+@pytest.mark.parametrize("name", ["mount.yaml", "covariance.npz", "report.json"])
+def test_a_folder_that_is_not_whole_is_refused_in_one_sentence(
+    flight: Any, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    folder = tmp_path / "cut"
+    shutil.copytree(direct, folder)
+    (folder / name).unlink()
+    assert main(["process", str(flight.log), "--trajectory", str(folder), "-o", str(tmp_path / "out")]) != 0
+    said = capsys.readouterr().err
+    assert name in said
+    assert said.count("\n") == 1
