@@ -44,7 +44,7 @@ __all__ = ["FORMAT_VERSION", "__version__"]
 
 
 def __getattr__(name: str) -> str:
-    """The version, looked up when it is asked for: that takes longer than all of a short command."""
+    """The version, looked up only on request: the look-up takes longer than a short command."""
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import PackageNotFoundError, version

@@ -94,7 +94,7 @@ def open_chunk(content: bytes) -> bytes:
     head = chunk_head(content[:CHUNK_HEAD_BYTES], len(content))
     packed = memoryview(content)[head.packed_start :]
     if head.compression == "zstd":
-        # a frame that states its own size would be given that much memory, whatever it is
+        # zstandard gives a frame the memory that the frame states, without limit
         if zstandard.frame_content_size(packed) not in (-1, head.size):
             raise RecordError("a chunk with two different sizes")
         plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=head.size)

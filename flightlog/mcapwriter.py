@@ -177,7 +177,7 @@ class McapWriter:
             self.close_chunk()
 
     def close_chunk(self) -> None:
-        """Write the chunk; OSError where the stream does not take it, and then it is lost and counted."""
+        """Write the chunk; OSError if the stream does not take it, in which case it is lost and counted."""
         chunk, self._chunk = self._chunk, _Chunk()
         if not chunk.size:
             return

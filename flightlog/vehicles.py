@@ -161,7 +161,7 @@ class Vehicles:
     def armed(self, now_ns: int) -> bool | None:
         """Whether the aircraft is armed: any vehicle heard lately that says so is believed; None where that is not known.
 
-        That it is disarmed is believed of its own autopilot only.
+        Only its own autopilot is believed when it says disarmed.
         """
         lately = {a: s for a, s in self.senders.items() if s.is_vehicle and now_ns - s.armed_ns <= SILENT_NS}
         if any(sender.armed for sender in lately.values()):

@@ -34,7 +34,7 @@ def text(severity: int, words: str) -> dialect.MAVLink_message:
 class Announcer:
     """Turns the state of each second into texts, at most one a call: on changes only.
 
-    What is good from the start is not told but for the lidar: a pilot waits for that.
+    What is good from the start is not announced, except for the lidar: a pilot waits for that.
     """
 
     def __init__(self) -> None:

@@ -188,7 +188,7 @@ class Link(Worker):
             self._take(source.read())
 
     def _take(self, chunks: list[Chunk]) -> None:
-        """Keep the chunks for the log, and have a look at the frames in them."""
+        """Keep the chunks for the log, and examine the frames in them."""
         self._chunks += chunks
         for time_ns, data in chunks:
             frames = self._parser.feed(time_ns, data)
@@ -247,7 +247,7 @@ def streams_asked(streams: StreamsConfig) -> list[tuple[str, int, int]]:
 
 
 def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
-    """Count frames; those of an id we cannot verify are no sign of life."""
+    """Count frames; those of an id that cannot be verified are no sign of life."""
     for frame in frames:
         if not frame.known:
             continue

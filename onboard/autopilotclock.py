@@ -80,7 +80,7 @@ class AutopilotClock:
         trips, stamps = self._trips.line(now_ns), self._envelope.line(now_ns)
         if trips is None or stamps is None:
             return trips or stamps
-        # TIMESYNC of some firmware counts from another moment than its stamps; the envelope then has what the log needs
+        # in some firmware TIMESYNC and the stamps have different zeros; the envelope then has what the log needs
         return trips if abs(trips.offset_ns - stamps.offset_ns) < NS_PER_S else stamps
 
     def sync(self, now_ns: int) -> ClockSync | None:

@@ -112,7 +112,7 @@ def blocks_inside(
 
 @lru_cache(maxsize=1)
 def _where(window: Window) -> npt.NDArray[np.uint8]:
-    """Where each azimuth lies, shape (65536,): a table, because a remainder costs ten times as much as a look into it."""
+    """Where each azimuth lies, shape (65536,): a table, because a remainder costs ten times as much as a look-up."""
     past = (np.arange(1 << 16) - window.start) % AZIMUTH_STEPS
     out = np.zeros(past.shape, np.uint8)
     out[past > AZIMUTH_STEPS - LARGEST_STEP - 1] = _AHEAD
