@@ -1,4 +1,4 @@
-"""Time scales, as int nanoseconds: Unix time and GPS time, counters that wrap, the hour that a top-of-hour stamp belongs to."""
+"""Time scales, as int nanoseconds: Unix and GPS time, counters that wrap, the hour of a top-of-hour stamp."""
 
 from bisect import bisect_right
 from datetime import UTC, datetime
@@ -49,19 +49,19 @@ def gps_week_to_utc_ns(week: int, tow_ms: int) -> int:
 
 
 def utc_text(utc_ns: int) -> str:
-    """ISO 8601 text of a Unix time, to the millisecond; one that no calendar has, beyond the year 9999, as seconds."""
+    """ISO 8601 text of a Unix time, to the millisecond; beyond the year 9999, which has no such text, as seconds."""
     if not _CALENDAR_NS[0] <= utc_ns <= _CALENDAR_NS[1]:
         return f"{utc_ns / NS_PER_S:.3f} s after 1970"
     return datetime.fromtimestamp(utc_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def unwrap_u32(values: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    """Carry a counter modulo 2^32 on, shape (n,); backward steps of less than half of it stay backward steps."""
+    """Unwrap a counter modulo 2^32, shape (n,); backward steps of less than half of it stay backward steps."""
     return unwrap(values, _U32)
 
 
 def unwrap(values: npt.NDArray[np.integer], modulus: int) -> npt.NDArray[np.int64]:
-    """Carry a wrapping counter on: each step is taken to be the one nearest to zero.
+    """Unwrap a counter: each step is taken to be the one nearest to zero.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def unwrap(values: npt.NDArray[np.integer], modulus: int) -> npt.NDArray[np.int6
     Returns
     -------
     ndarray of int64, shape (n,)
-        Starts at the first reading as it is.
+        Starts at the first reading, unchanged.
     """
     plain = np.asarray(values).astype(np.int64)
     if plain.size == 0:
@@ -86,7 +86,7 @@ def unwrap(values: npt.NDArray[np.integer], modulus: int) -> npt.NDArray[np.int6
 def unwrap_top_of_hour_ns(
     stamps_us: npt.NDArray[np.integer], host_ns: npt.NDArray[np.int64], last_ns: int | None = None
 ) -> npt.NDArray[np.int64]:
-    """Carry the lidar's microseconds past the hour on to one continuous scale.
+    """Unwrap the lidar's microseconds past the hour to one continuous scale.
 
     Each step is taken modulo an hour and nearest to what the host clock says has passed, so that a silence of hours, a stamp that
     runs on past 3600 s before it resets, and packets that come a little out of order are all told apart.

@@ -65,7 +65,7 @@ def option(
     Parameters
     ----------
     default : object
-        Its value when the file does not say; a dataclass type makes a nested section with that section's own defaults.
+        Its value when the file does not state it; a dataclass type makes a nested section with that section's own defaults.
     about : str
         One line for the sample file: meaning and unit.
     minimum, maximum : float, optional
@@ -141,7 +141,7 @@ def _convert(value: Any, hint: Any, rules: Mapping[str, Any], place: str) -> Any
         if value is None and type(None) in typing.get_args(hint):
             return None
         arms = [arm for arm in typing.get_args(hint) if arm is not type(None)]
-        # of several, a text is taken as a text, all else as what stands first
+        # of several types, a text is taken as a text, everything else as the first type
         hint = str if str in arms and isinstance(value, str) else arms[0]
         return _convert(value, hint, rules, place)
     if dataclasses.is_dataclass(hint):

@@ -1,7 +1,8 @@
-"""MCAP records as bytes (mcap.dev/spec): what a reader needs of them, and how to tell a whole record from a damaged one. Pure.
+"""MCAP records as bytes (mcap.dev/spec): what a reader needs, and how to tell a whole record from a damaged one. Pure.
 
-Only chunks and attachments carry a checksum of their own. Everything else is held to its own lengths: a record whose parts do not
-add up to its size is damaged, so that one wrong bit in a length or an opcode cannot make a reader step over good chunks.
+Only chunks and attachments have a checksum of their own. All other records are checked by their lengths: a record
+whose parts do not add up to its size is damaged. One wrong bit in a length or an opcode therefore cannot make a
+reader skip good chunks.
 """
 
 import re
@@ -93,7 +94,7 @@ def open_chunk(content: bytes) -> bytes:
     head = chunk_head(content[:CHUNK_HEAD_BYTES], len(content))
     packed = memoryview(content)[head.packed_start :]
     if head.compression == "zstd":
-        # a frame that states its own size would be given that much memory, whatever it is
+        # zstandard gives a frame the memory that the frame states, without limit
         if zstandard.frame_content_size(packed) not in (-1, head.size):
             raise RecordError("a chunk with two different sizes")
         plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=head.size)

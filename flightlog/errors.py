@@ -1,7 +1,7 @@
 """The one tree of errors that a user can meet.
 
-Every message is one sentence that states the value found, what was expected, and the place (file, key, byte). Programs show it
-as it is and end with `exit_code`; a traceback is for our own mistakes only.
+Every message is one sentence that states the value found, what was expected, and the place (file, key, byte).
+Programs show it unchanged and end with `exit_code`. A traceback is for our own mistakes only.
 """
 
 

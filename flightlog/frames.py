@@ -1,8 +1,8 @@
 """Rotations of the project: the equation of its source, attitudes of an autopilot, quaternions.
 
-All functions take scalars or arrays and broadcast; angles in radians; matrices have shape (..., 3, 3), quaternions (..., 4), scalar
-first. The source (FOI-R--4045--SE) writes row vectors, p_b = p_a @ R(g, a, b); what is called mat_ab here is column form, and
-R for a step from a to b equals mat_ba.T.
+All functions take scalars or arrays and broadcast. Angles are in radians; matrices have shape (..., 3, 3),
+quaternions (..., 4), scalar first. The source (FOI-R--4045--SE) writes row vectors, p_b = p_a @ R(g, a, b).
+Matrices called mat_ab here are in column form, and R for a step from a to b equals mat_ba.T.
 """
 
 from typing import TypeAlias

@@ -1,7 +1,8 @@
 """A flight log on disk: LogWriter, and LogReader, which also reads what a power cut left.
 
-The container is MCAP (mcap.dev/spec). Its bytes are in `mcapwriter`, `container` and `walk`: a library's reader gives up at the
-first damaged byte, its writer at a full disk, and a log from a bad day is the one that matters most.
+The container is MCAP (mcap.dev/spec); its bytes are in `mcapwriter`, `container` and `walk`. A library's reader
+gives up at the first damaged byte, and its writer on a full disk. The log from a bad day is the one that matters
+most.
 """
 
 import json

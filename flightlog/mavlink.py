@@ -1,7 +1,7 @@
 """MAVLink 1 and 2: frames out of raw bytes, and messages of one kind as a numpy table.
 
-The dialect is pymavlink's `ardupilotmega`; framing is ours because a log holds bytes as they came, with their own receive times,
-and because frames whose checksum cannot be known must not pass for messages.
+The dialect is pymavlink's `ardupilotmega`. Framing is our own for two reasons: a log holds bytes as received, with
+their own receive times, and frames whose checksum cannot be verified must not pass for messages.
 """
 
 import re
@@ -56,7 +56,7 @@ class Frame(NamedTuple):
 
 
 class FrameParser:
-    """Cuts a byte stream into frames; keeps an unfinished one until the rest comes.
+    """Cuts a byte stream into frames; keeps an unfinished one until the rest arrives.
 
     Which known frames come out does not depend on how the stream was cut into pieces.
 
@@ -84,7 +84,7 @@ class FrameParser:
         return self._cut(last=False)
 
     def finish(self) -> list[Frame]:
-        """Give what frames are left among the bytes held back, and count the rest as bad: no more bytes will come."""
+        """Give the frames left among the bytes held back, and count the rest as bad: no more bytes will come."""
         return self._cut(last=True)
 
     def _cut(self, *, last: bool) -> list[Frame]:
@@ -141,7 +141,7 @@ def _frame_at(buffer: bytes, offset: int, *, last: bool) -> Frame | _Answer:
 
 
 def _doubt(buffer: bytes, offset: int, end: int) -> _Answer | None:
-    """What speaks against a frame with an id outside the dialect: noise looks like one too, and must not hide known frames."""
+    """Reasons to doubt a frame with an id outside the dialect: noise can look like one, and must not hide known frames."""
     if end < len(buffer) and not _START.match(buffer, end):
         return _Answer.NONE
     doubt = None
@@ -165,7 +165,7 @@ def _next_start(buffer: bytes, offset: int) -> int:
 
 
 def _frame_size(buffer: bytes, offset: int) -> int | None:
-    """Size that the frame at `offset` claims: None where too little of it is there to tell, 0 where none can start."""
+    """Size that the frame at `offset` claims: None if too little of it has arrived, 0 if no frame can start there."""
     if len(buffer) < offset + 3:
         return None
     if buffer[offset] == _STX_1:
@@ -285,7 +285,7 @@ def autopilots(frames: Iterable[Frame]) -> list[tuple[int, int]]:
 
 
 def decode(frame: Frame) -> Any | None:
-    """The frame as pymavlink's message object, None for an unknown one; for the odd message, not for streams."""
+    """The frame as pymavlink's message object, None for an unknown one; for single messages, not for streams."""
     return _DECODER.decode(bytearray(frame.data)) if frame.known else None
 
 

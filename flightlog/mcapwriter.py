@@ -1,7 +1,8 @@
 """Writes MCAP records (mcap.dev/spec) to a stream: chunks with their indexes, metadata, attachments, summary.
 
-A writer of our own because a log aboard meets full disks: here a record is in the file whole or not at all, the summary lists what
-is there and nothing else, and what was lost is known. It also copies and compresses no more than it must.
+This is a writer of our own because a log aboard meets full disks. Here a record is written whole or not at all, the
+summary lists only what is in the file, and what was lost is known. It also copies and compresses no more than it
+must.
 """
 
 import contextlib
@@ -176,7 +177,7 @@ class McapWriter:
             self.close_chunk()
 
     def close_chunk(self) -> None:
-        """Write the chunk; OSError where the stream does not take it, and then it is lost and counted."""
+        """Write the chunk; OSError if the stream does not take it, in which case it is lost and counted."""
         chunk, self._chunk = self._chunk, _Chunk()
         if not chunk.size:
             return

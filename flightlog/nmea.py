@@ -89,6 +89,6 @@ def format_rmc(utc_ns: int, latitude_deg: float, longitude_deg: float, *, valid:
 
 
 def _degrees_minutes(angle_deg: float, degree_digits: int) -> str:
-    """Ddmm.mmmm of an angle; rounded before it is split, so that no minutes read 60."""
+    """Ddmm.mmmm of an angle; rounded before it is split, so that minutes never read 60."""
     degrees, minutes = divmod(round(abs(angle_deg) * 600_000), 600_000)
     return f"{degrees:0{degree_digits}d}{minutes / 10_000:07.4f}"

@@ -1,7 +1,7 @@
 """The table of what a flight log holds: topic, type, meaning; and the bytes of each record, encode beside decode.
 
-Every record is plain CDR (little endian, XCDR1) of a ROS 2 message type, so that Foxglove, rosbags and ROS 2 read a log as it is.
-Alignment counts from the byte after the 4-byte encapsulation header.
+Every record is plain CDR (little endian, XCDR1) of a ROS 2 message type, so Foxglove, rosbags and ROS 2 can read a
+log without conversion. Alignment counts from the byte after the 4-byte encapsulation header.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""Makes a whole log of a cut or damaged one, and says exactly what was lost. Used aboard at the next start, and on the ground."""
+"""Makes a whole log of a cut or damaged one and reports exactly what was lost. Used aboard and on the ground."""
 
 import json
 import os

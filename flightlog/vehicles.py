@@ -1,8 +1,9 @@
 """Who is the autopilot, among all that speak on a MAVLink link: one rule for the recorder and for the ground.
 
-Ground stations, gimbals and companions send heartbeats too, some of them with the words of an autopilot. So what counts first is what
-only an autopilot sends, attitudes; then the component number 1, which autopilots have; then a heartbeat of a vehicle's type. Among equals
-it is the one heard first. A vehicle that falls silent gives way, because system ids may be changed in flight.
+Ground stations, gimbals and companions send heartbeats too, some of them with the fields of an autopilot. The first
+criterion is therefore a message that only an autopilot sends, attitudes. The second is component number 1, which
+autopilots have, and the third a heartbeat of a vehicle's type. Among equals, the one heard first wins. A vehicle that
+falls silent gives way, because system ids may be changed in flight.
 """
 
 from dataclasses import dataclass, field
@@ -160,7 +161,7 @@ class Vehicles:
     def armed(self, now_ns: int) -> bool | None:
         """Whether the aircraft is armed: any vehicle heard lately that says so is believed; None where that is not known.
 
-        That it is disarmed is believed of its own autopilot only.
+        Only its own autopilot is believed when it says disarmed.
         """
         lately = {a: s for a, s in self.senders.items() if s.is_vehicle and now_ns - s.armed_ns <= SILENT_NS}
         if any(sender.armed for sender in lately.values()):

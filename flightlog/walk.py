@@ -1,4 +1,4 @@
-"""A walk over the top level of an MCAP file, record by record, that steps over what is damaged and finds its way back."""
+"""Walks over the top level of an MCAP file, record by record, skips what is damaged, and finds the next good record."""
 
 import zlib
 from collections.abc import Iterator
@@ -121,7 +121,7 @@ class Walk:
             return None
 
     def _step_over(self, offset: int) -> int:
-        """Where to go on behind a damaged record: where it claims to end, the next good chunk, the summary, or the end."""
+        """Where to continue after a damaged record: at its claimed end, the next good chunk, the summary, or the end."""
         claimed = self._claimed_end(self._read(offset, RECORD_HEAD.size), offset)
         if claimed is not None and claimed < self._end and self._record(claimed) is not None:
             return claimed

@@ -1,7 +1,7 @@
-"""Words from strangers, made harmless before they reach a terminal, a journal, a pilot's screen or a file.
+"""Text from outside, made harmless before it reaches a terminal, a journal, a pilot's screen or a file.
 
-A GPS sentence, a parameter's name, what another machine's shell says, the name of a file: each may hold escapes that move the
-cursor, forge a line or hide one. Every string from outside goes through `clean` before it is shown.
+A GPS sentence, the name of a parameter or a file, or the output of another machine's shell may hold escapes that move
+the cursor, or forge or hide a line. Every string from outside goes through `clean` before it is shown.
 """
 
 import unicodedata

@@ -2,38 +2,42 @@
 
 Map
 ---
-config       what the operator may set
-fovmask      which packets and blocks lie outside the field of view (pure)
-timesync     log time from the host's clocks; kernel receive times through a step of the wall clock (pure)
-health       the status of everything, and the verdict on it (pure)
-clocksync    how the clocks of autopilot and lidar stand to log time (pure)
-datagrams    many datagrams of a socket in one system call, with the kernel's receive times and drop counts
-packetfilter  a socket's filter in the kernel: one sender, one length
-lidar        the HDL-32E's two ports -> batches; who the lidar is
-batch        slots that fill up until a message is due
-lidarstate   the state of the lidar, by name
-sensorview   how the lidar is set, by its packets (pure)
-sources      the serial device or UDP port of a MAVLink link
-autopilot    MAVLink links -> raw chunks; asks for the streams
+config          what the operator may set
+fovmask         which packets and blocks lie outside the field of view (pure)
+timesync        log time from the host's clocks; kernel receive times across a step of the wall clock (pure)
+health          the status of everything, and the verdict on it (pure)
+clocksync       how the clocks of autopilot and lidar stand to log time (pure)
+datagrams       many datagrams of a socket in one system call, with the kernel's receive times and drop counts
+packetfilter    a socket's filter in the kernel: sender, length, interface
+lidar           the HDL-32E's two ports -> batches; who the lidar is
+batch           slots that collect datagrams until a message is due
+lidarstate      the state of the lidar, by name
+sensorview      the lidar's settings, inferred from its packets (pure)
+sources         the serial device or UDP port of a MAVLink link
+autopilot       MAVLink links -> raw chunks; asks for the streams
 autopilotclock  an autopilot's boot time and UTC: TIMESYNC, or its stamps
-voice        our frames on a link, in the autopilot's version
-announce     what the ground station is told (pure)
-readings     what the receivers count -> what the status says
-preflight    everything tried before a flight
-recorder     bounded backlog -> segments of the flight log, synced to the disk twice a second; watches the space left
-segment      one file of the flight log, until it is read-only and in the manifest
-logfolder    names, manifest, space
-leftovers    logs that a power cut left open, mended beside the recording
-relay        live downlink: what is received goes to the ground as well, and never harms the recording
+voice           our frames on a link, in the autopilot's version of MAVLink
+announce        what the ground station is told (pure)
+readings        the receivers' counters -> the status
+preflight       the checks before a flight
+recorder        bounded backlog -> segments of the flight log, synced to the disk twice a second; watches free space
+segment         one file of the flight log, until it is read-only and in the manifest
+logfolder       names, manifest, space
+leftovers       logs that a power cut left open, mended while recording goes on
+relay           live downlink: sends to the ground what is received, and never harms the recording
 lidar_settings  the lidar's web server: settings compared, set, verified
-parameters   files of autopilot parameters, and the comparison (pure)
+parameters      files of autopilot parameters, and the comparison (pure)
 parameter_link  parameters over MAVLink: read, set, confirmed
-commands     commands of `swathd` beside recording
-worker       a thread whose progress is watched
-notify       word to systemd
-daemon       start, run, stop
-cli          the command line
+commands        commands of `swathd` other than recording
+worker          a thread whose progress is watched
+notify          messages to systemd
+journal         log lines, with fields where there is a journal
+gate            what a key of `swath pull` may do
+install         `swathd install` and `uninstall`
+daemon          start, run, stop
+cli             the command line
 
-How it runs: one thread polls the lidar's sockets, one each MAVLink link, one writes, and the main thread keeps the clocks, the
-status and the watchdog. Receivers never wait for the writer: what its backlog cannot take is dropped and counted.
+How it runs: one thread polls the lidar's sockets, one serves each MAVLink link, and one writes. The main thread
+runs the clocks, the status and the watchdog. Receivers never wait for the writer: what its backlog cannot take is
+dropped and counted.
 """

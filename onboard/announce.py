@@ -1,4 +1,4 @@
-"""What the pilot's ground station is told: a text when something changes, and a few numbers. Pure: findings in, messages out."""
+"""What the pilot's ground station is told: a text when something changes, and a few numbers. Pure."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ def text(severity: int, words: str) -> dialect.MAVLink_message:
 class Announcer:
     """Turns the state of each second into texts, at most one a call: on changes only.
 
-    What is good from the start is not told but for the lidar: a pilot waits for that.
+    What is good from the start is not announced, except for the lidar: a pilot waits for that.
     """
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
-"""MAVLink links, serial or UDP: bytes into the log exactly as received; listened to only to know that the autopilot lives.
+"""MAVLink links, serial or UDP: bytes are logged as received, and parsed only to see if the autopilot is alive.
 
-The link may come and go: it is opened again and again, and the rest of the daemon does not notice.
+The link may come and go: it is reopened as often as needed, and the rest of the daemon does not notice.
 """
 
 import logging
@@ -188,7 +188,7 @@ class Link(Worker):
             self._take(source.read())
 
     def _take(self, chunks: list[Chunk]) -> None:
-        """Keep the chunks for the log, and have a look at the frames in them."""
+        """Keep the chunks for the log, and examine the frames in them."""
         self._chunks += chunks
         for time_ns, data in chunks:
             frames = self._parser.feed(time_ns, data)
@@ -247,7 +247,7 @@ def streams_asked(streams: StreamsConfig) -> list[tuple[str, int, int]]:
 
 
 def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
-    """Count frames; those of an id we cannot verify are no sign of life."""
+    """Count frames; those of an id that cannot be verified are no sign of life."""
     for frame in frames:
         if not frame.known:
             continue

@@ -1,4 +1,4 @@
-"""An autopilot's boot time and UTC on log time, from what it sends: TIMESYNC where it speaks that, else its stamps and SYSTEM_TIME."""
+"""An autopilot's boot time and UTC on log time: from TIMESYNC if it speaks that, else its stamps and SYSTEM_TIME."""
 
 import struct
 from typing import Final
@@ -80,7 +80,7 @@ class AutopilotClock:
         trips, stamps = self._trips.line(now_ns), self._envelope.line(now_ns)
         if trips is None or stamps is None:
             return trips or stamps
-        # TIMESYNC of some firmware counts from another moment than its stamps; the envelope then has what the log needs
+        # in some firmware TIMESYNC and the stamps have different zeros; the envelope then has what the log needs
         return trips if abs(trips.offset_ns - stamps.offset_ns) < NS_PER_S else stamps
 
     def sync(self, now_ns: int) -> ClockSync | None:

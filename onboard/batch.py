@@ -46,7 +46,7 @@ class Batch:
         return self._count == len(self.slots)
 
     def fill(self) -> int:
-        """Take what is waiting, as far as there are slots; gives the number of datagrams."""
+        """Take the waiting datagrams, as far as there are slots; gives their number."""
         first = self._count
         count = self.receiver.receive(first)
         if count:
@@ -59,7 +59,7 @@ class Batch:
         return count
 
     def due(self) -> bool:
-        """Whether what is in here will be as old as a message may be before anyone looks again."""
+        """Whether the content will reach the greatest age of a message before the next poll."""
         if not self._count:
             return False
         age_ns = self._log_time.anchor_ns + time.monotonic_ns() - int(self._time_ns[0])

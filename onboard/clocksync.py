@@ -1,8 +1,9 @@
 """How the clocks of autopilot and lidar stand to log time. Pure: samples in, a line out.
 
-An autopilot that speaks TIMESYNC is asked: its answer lies between our question and its arrival, and the shortest round trips know
-best. Others only send their stamps. A stamp is never received before it was made, so the line that lies on top of all (stamp -
-receive time) is the best guess; the delay that every message has stays in it.
+An autopilot that speaks TIMESYNC is asked: its answer lies between our question and the arrival, and the shortest
+round trips are the most accurate. Other autopilots only send their stamps. No stamp can be received before it was
+made, so the best estimate is the upper envelope of (stamp - receive time). It still contains the delay that every
+message has.
 """
 
 from collections import deque
@@ -78,14 +79,14 @@ class RoundTrips:
         if not self._trips:
             return None
         rtt_ns = np.array([trip.rtt_ns for trip in self._trips])
-        # whoever waited on the way says little: the quicker half has what there is to know
+        # answers that were delayed say little: the faster half has the information
         best = np.flatnonzero(rtt_ns <= np.median(rtt_ns))
         base = self._trips[int(np.argmin(rtt_ns))]
         time_s = np.array([self._trips[i].log_ns - base.log_ns for i in best]) / NS_PER_S
         offset_ns = np.array([self._trips[i].offset_ns - base.offset_ns for i in best], np.float64)
         skew = 0.0
         if len(best) >= 8 and np.ptp(time_s) * NS_PER_S >= _SKEW_SPAN_NS:
-            # an answer is wrong by up to half of what its trip took longer than the shortest
+            # the error of an answer is up to half of its trip's excess over the shortest trip
             sigma_ns = (rtt_ns[best] - rtt_ns.min()) / 2 + 0.02 * rtt_ns.min() + 1000
             slope, level = _robust_line(time_s, offset_ns, sigma_ns)
             skew = float(np.clip(slope / NS_PER_S, -_SKEW_LIMIT, _SKEW_LIMIT))
@@ -96,7 +97,7 @@ class RoundTrips:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
-    """Slope and level at x = 0 by weighted least squares, what is far off left out in a second go."""
+    """Slope and level at x = 0 by weighted least squares; a second pass leaves out what is far off."""
     keep = np.ones(len(x), np.bool_)
     slope = level = 0.0
     for _ in range(3):
@@ -135,7 +136,7 @@ class Envelope:
             last_ns = self._tops[-1][1]
             if self._period_ns is not None:
                 offset_ns += round((last_ns - offset_ns) / self._period_ns) * self._period_ns
-            # one that is late only waited; one that is early, or many that are late, and the clock was set
+            # a late stamp was only delayed; an early one, or many late ones, mean that the clock was set
             if offset_ns - last_ns > _JUMP_NS or (offset_ns - last_ns < -_JUMP_NS and self._is_lost()):
                 self._tops.clear()
                 self.restarts += 1

@@ -1,4 +1,4 @@
-"""Start, run, stop. Signals set a flag; the watchdog is earned; whatever happens, the log is closed well."""
+"""Start, run, stop. Signals set a flag, the watchdog is fed only on progress, and the log is always closed."""
 
 import gc
 import logging
@@ -53,7 +53,7 @@ _END_S: Final = 60.0
 class Landing:
     """Tells a landing from an autopilot, or a stranger, that flips between armed and disarmed.
 
-    Landed is who stays disarmed for `DISARMED_S`; and nobody lands again within `APART_S`.
+    A vehicle has landed if it stays disarmed for `DISARMED_S`; no second landing counts within `APART_S`.
     """
 
     DISARMED_S: Final = 5.0
@@ -80,7 +80,7 @@ class Landing:
 
 
 class Daemon:
-    """The running whole.
+    """The running daemon.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Daemon:
 
     @property
     def _workers(self) -> list[Worker]:
-        """In the order in which they are stopped: who writes comes last."""
+        """In the order in which they are stopped: the writer comes last."""
         assert self._recorder is not None
         return [self._lidar, *self._links.values(), self._recorder]
 
@@ -194,7 +194,7 @@ class Daemon:
         SwathError
             A worker died; the log was closed as well as could be.
         """
-        # A thread that computes gives way after 1 ms instead of 5: the lidar's must not wait for the writer's.
+        # A computing thread yields after 1 ms instead of 5: the lidar's must not wait for the writer's.
         sys.setswitchinterval(0.001)
         gc.freeze()  # what was made so far is there to stay: no need to walk over it again and again
         for worker in reversed(self._workers):
@@ -264,7 +264,7 @@ class Daemon:
         return syncs
 
     def _announce(self, status: Status) -> None:
-        """Tell the pilot, through the autopilots; news wait until one listens."""
+        """Tell the pilot, through the autopilots; messages wait until one listens."""
         if not any(link.listens for link in self._links.values()):
             return
         text = self._announcer.next(announce.states(status))

@@ -1,7 +1,7 @@
-"""UDP reception: many datagrams in one system call, each with the kernel's receive time; losses in the socket counted by it too.
+"""UDP reception: many datagrams in one system call, each with the kernel's receive time and its count of losses.
 
-recvmmsg(2) fills an array in place. What makes it cheap is the caller's habit of coming only every few milliseconds: a call that
-waits would wake up for each packet. Structures are those of a 64-bit Linux.
+recvmmsg(2) fills an array in place. It is cheap because the caller polls only every so many milliseconds: a call
+that waits would wake up for each packet. The structures are those of a 64-bit Linux.
 """
 
 import ctypes
@@ -79,7 +79,7 @@ def open_udp(address: str, port: int, receive_buffer_bytes: int) -> socket.socke
 
 
 def granted_buffer_bytes(sock: socket.socket) -> int:
-    """What the kernel gave of the receive buffer asked for; it counts its own bookkeeping double."""
+    """How much of the requested receive buffer the kernel granted; it doubles the value for its own bookkeeping."""
     return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
@@ -131,11 +131,11 @@ class Receiver:
         self._messages["iov_count"] = 1
         self._messages["control"] = self._control.ctypes.data + index * np.uint64(_CONTROL_DTYPE.itemsize)
         self._messages["control_size"] = _CONTROL_DTYPE.itemsize
-        # Made once: a field of a structured array and an address take longer to get than most of what is done with them.
+        # Made once: getting a field of a structured array or an address takes longer than most uses of it.
         self._address = int(self._messages.ctypes.data)
         self._message_size, self._message_flags = self._messages["size"], self._messages["flags"]
         self._control_size = self._messages["control_size"]
-        # What the kernel tells of each datagram as three words: size of the control messages, flags, size.
+        # What the kernel reports of each datagram, as three words: size of the control messages, flags, size.
         self._told = self._messages.view(np.uint64).reshape(count, -1)[:, 5:]
         self._usual = np.array([_WITH_TIME, 0, size], np.uint64)
         self._stamp_s, self._stamp_part_ns = self._control["sec"], self._control["nanosec"]
@@ -188,7 +188,7 @@ class Receiver:
         return count
 
     def _note_unusual(self, part: slice, stamps_ns: npt.NDArray[np.int64]) -> None:
-        """Some are shorter or longer, or the kernel told of drops, or gave no time."""
+        """Handle datagrams of other lengths, reported drops, and missing times."""
         self.sizes[part] = self._message_size[part]
         flags = self._message_flags[part]
         self.sizes[part][flags & socket.MSG_TRUNC != 0] = self._limit + 1
@@ -198,7 +198,7 @@ class Receiver:
             self._count_drops(int(self._control["drops"][part][-1]), is_lost=True)
 
     def count_last_drops(self) -> None:
-        """Ask the kernel for drops that no later datagram has told of.
+        """Ask the kernel for drops that no later datagram has reported.
 
         It counts what the filter refused and what found no room alike. But the queue only grows until we empty it: where it had room
         to spare both now and the time before, nothing can have been lost in between, and it was the filter.

@@ -1,7 +1,7 @@
-"""The field of view: packets wholly outside are left out, blocks outside in a packet that straddles its edge lose their ranges.
+"""The field of view: packets wholly outside are left out; in a packet across its edge, the blocks outside lose ranges.
 
-What lies inside is never touched. A block is not one direction: its 32 shots sweep on from the block's azimuth while the head
-turns, so a block stays if any of its shots lies inside.
+What lies inside is never touched. A block does not have a single direction: its 32 shots sweep on from the block's
+azimuth while the head turns, so a block stays if any of its shots lies inside.
 """
 
 from dataclasses import dataclass
@@ -112,7 +112,7 @@ def blocks_inside(
 
 @lru_cache(maxsize=1)
 def _where(window: Window) -> npt.NDArray[np.uint8]:
-    """Where each azimuth lies, shape (65536,): a table, because a remainder costs ten times as much as a look into it."""
+    """Where each azimuth lies, shape (65536,): a table, because a remainder costs ten times as much as a look-up."""
     past = (np.arange(1 << 16) - window.start) % AZIMUTH_STEPS
     out = np.zeros(past.shape, np.uint8)
     out[past > AZIMUTH_STEPS - LARGEST_STEP - 1] = _AHEAD

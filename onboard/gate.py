@@ -1,4 +1,4 @@
-"""What a key of the pull may do here: look at the health, read the manifest and the flight logs, acknowledge them. Nothing else."""
+"""What a key of the pull may do here: see the health, read the manifest and flight logs, acknowledge them. No more."""
 
 import fcntl
 import json

@@ -1,4 +1,4 @@
-"""`swathd install` and `uninstall`: the service, its user, devices, network and sysctl files put in place, and taken away again."""
+"""`swathd install` and `uninstall`: the service, its user, devices, network and sysctl files."""
 
 import contextlib
 import subprocess
@@ -168,7 +168,7 @@ def _bring_up(root: Path, network: bool, start: bool) -> list[str]:
     if not _runs(root):
         _call("systemctl", "enable", "swathd.service")
         return ["enabled swathd.service: it starts when systemd boots"]
-    # a container may neither set the receive buffers nor have devices: its host has to
+    # a container can neither set the receive buffers nor have devices: its host has to
     _try("sysctl", "--quiet", "--load=/etc/sysctl.d/70-swathd.conf")
     _try("udevadm", "control", "--reload")
     _try("udevadm", "trigger", "--subsystem-match=tty")

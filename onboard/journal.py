@@ -1,6 +1,7 @@
-"""The daemon's words: to the journal with fields that can be searched for, elsewhere as lines of text.
+"""The daemon's log messages: to the journal with fields that can be searched for, elsewhere as lines of text.
 
-`journalctl SWATH_EVENT=hang` finds what `_log.error(..., extra=event("hang", worker="lidar"))` said, and `-o json` has SWATH_WORKER.
+`journalctl SWATH_EVENT=hang` finds the message of `_log.error(..., extra=event("hang", worker="lidar"))`, and `-o
+json` shows SWATH_WORKER.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""Logs that a power cut or a crash left open: mended beside the recording, slowly, so that it is not disturbed."""
+"""Logs that a power cut or a crash left open: mended slowly while recording goes on, so that it is not disturbed."""
 
 import fcntl
 import logging
@@ -73,7 +73,7 @@ class Salvager(threading.Thread):
             self.join(10)
 
     def run(self) -> None:
-        """Mend one after the other; nothing that goes wrong here ends the recording."""
+        """Mend one after the other; no failure here ends the recording."""
         for path in self._paths:
             try:
                 self._mend(path)
@@ -103,7 +103,7 @@ class Salvager(threading.Thread):
             self._rewrite(path)
 
     def _is_log(self, path: Path) -> bool:
-        """Set aside what is none: the power went before the first sync."""
+        """Set aside a file that is no log: the power failed before the first sync."""
         try:
             LogReader(path).close()
         except LogError as error:
@@ -155,7 +155,7 @@ class Salvager(threading.Thread):
         logfolder.enter(self._directory, entry)
 
     def _pace(self, done_bytes: int) -> None:
-        """Called with what was read since: wait as long as that may take, and sync what was written."""
+        """Called with the bytes read since: wait to keep the pace, and sync what was written."""
         if self._stop_asked.wait(done_bytes / _BYTES_PER_S):
             raise _StoppedError
         self._unsynced += done_bytes
@@ -174,7 +174,7 @@ class Salvager(threading.Thread):
 
 
 def begin(directory: Path, keep_free_bytes: int, compression: str) -> Salvager:
-    """Look for leftovers, and throw away what an interrupted salvage left of its own; the thread is not started yet."""
+    """Look for leftovers, and delete the remains of an interrupted salvage; the thread is not started yet."""
     for path in directory.glob(f"*{_TEMPORARY}"):
         path.unlink(missing_ok=True)
     return Salvager(directory, logfolder.leftovers(directory), keep_free_bytes, compression)

@@ -187,7 +187,7 @@ class LidarPort(Worker):
         self._open()
 
     def _pause_for_buffer(self, poll_s: float, asked_bytes: int) -> float:
-        """Time between two polls that the receive buffer stands; a small one is told of."""
+        """Longest pause between polls that the receive buffer can bridge; a small buffer is reported."""
         granted = granted_buffer_bytes(self._data_socket)
         if granted < asked_bytes:
             _log.warning(
@@ -251,7 +251,7 @@ class LidarPort(Worker):
     # The sensor and others ----------------------------------------------------------------------------------------
 
     def view(self) -> SensorView | None:
-        """How the lidar is set, by what came since this was last asked; None: nothing came."""
+        """How the lidar is set, by the packets since the last call; None: there were none."""
         looks, self._looks = self._looks, deque(maxlen=_LOOKS)
         if not looks:
             return None

@@ -130,7 +130,7 @@ class LidarWeb:
 
     def __init__(self, address: str) -> None:
         self.address = address
-        # what is on the cable is reached without the proxy that the environment may name
+        # the sensor is on the local cable: ignore any proxy that the environment names
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
     def read(self, name: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What state the lidar is in, by name: whether to look at the cable, the power or the settings. Pure but for `carrier`."""
+"""The state of the lidar, by name: whether to check the cable, the power or the settings. Pure but for `carrier`."""
 
 import socket
 import struct

@@ -172,7 +172,7 @@ def sha256(path: Path, progress: Callable[[int], None] | None = None) -> str:
 
 
 def leftovers(directory: Path) -> list[Path]:
-    """Segments that are in no manifest: who wrote them was cut off."""
+    """Segments that are in no manifest: their writer was cut off."""
     known = read_manifest(directory)
     names = (path.name for path in directory.glob("*.mcap") if _NAME.fullmatch(path.name) and path.name not in known)
     return [directory / name for name in in_order(names)]
@@ -207,7 +207,7 @@ def free_bytes(directory: Path) -> int:
 
 
 def hold_reserve(directory: Path) -> None:
-    """Keep some space back, so that a log can be closed on a disk that somebody filled up."""
+    """Reserve some space, so that a log can be closed on a disk that another program filled."""
     try:
         with (directory / _RESERVE).open("wb") as file:
             os.posix_fallocate(file.fileno(), 0, _RESERVE_BYTES)
@@ -223,7 +223,7 @@ def release_reserve(directory: Path) -> None:
 def prune(directory: Path, enough: Callable[[], bool]) -> list[str]:
     """Delete the oldest segments that are on the ground, acknowledged, until there is enough space; gives their names.
 
-    What nobody acknowledged is never deleted.
+    Segments that nobody acknowledged are never deleted.
     """
     safe = acknowledged(directory)
     gone = []

@@ -1,4 +1,4 @@
-"""Word to systemd: READY, STATUS, WATCHDOG, STOPPING. Does nothing where systemd did not start us."""
+"""Messages to systemd: READY, STATUS, WATCHDOG, STOPPING. Does nothing if systemd did not start us."""
 
 import os
 import socket

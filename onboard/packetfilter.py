@@ -1,7 +1,7 @@
-"""A socket's own filter in the kernel: only datagrams of one length, sender or interface are queued, so that a flood costs no buffer.
+"""A socket's own filter in the kernel: only datagrams of one length, sender or interface are queued.
 
-Classic BPF (Linux socket filter, linux/filter.h) needs no privilege. For a UDP socket a program sees the datagram from its UDP
-header on; the IP header is reached at SKF_NET_OFF.
+A flood therefore takes no room in the buffer. Classic BPF (Linux socket filter, linux/filter.h) needs no privilege.
+For a UDP socket a program sees the datagram from its UDP header on; the IP header is reached at SKF_NET_OFF.
 """
 
 import ctypes

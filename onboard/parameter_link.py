@@ -1,4 +1,4 @@
-"""Parameters over MAVLink: read, set, and read back. A frame may be lost either way; nothing counts that was not confirmed."""
+"""Parameters over MAVLink: read, set, and read back. Frames may be lost both ways; only confirmed values count."""
 
 import functools
 import math
@@ -129,7 +129,7 @@ class ParameterLink:
         before = 0
         for attempt in range(_TRIES):
             missing = [name for name in wanted if name not in self.values]
-            # an autopilot does not answer for what it does not have: once all others came, two more tries do
+            # an autopilot does not answer for a parameter that it lacks: once all others arrived, two more tries are enough
             if not missing or (attempt >= 3 and len(missing) == before):
                 break
             before = len(missing)
@@ -252,7 +252,7 @@ class ParameterLink:
             self.values.pop(name, None)
             self._send(self._mavlink.param_set_encode(system, component, name.encode(), single, kind))
             self._until(lambda: name in self.values, _WAIT_S)
-            # what it says on PARAM_SET may be what it was told; what counts is what it says when asked
+            # the reply to PARAM_SET may only echo the value; the answer to a later request is what counts
             if self.read([name]).get(name) == single:
                 return
         found = self.values.get(name)

@@ -1,4 +1,4 @@
-"""Before a flight: everything that must be there is tried, and whatever fails comes with its remedy. Nothing is recorded."""
+"""Before a flight: everything that is needed is tested, and each failure comes with its remedy. Nothing is recorded."""
 
 import os
 import tempfile

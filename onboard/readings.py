@@ -1,4 +1,4 @@
-"""What the receivers count, read once a second into what the status says: rates, ages, states."""
+"""The receivers' counters, read once a second and turned into the status: rates, ages, states."""
 
 import time
 from collections import deque
@@ -77,7 +77,7 @@ class LidarReadings:
         return lidarstate.carrier(self._interface)
 
     def _is_steady(self, log_ns: int, age_s: float | None) -> bool:
-        """Whether the stream has gone on for long enough to tell its rate; batches make that of one second uneven by a tenth."""
+        """Whether the stream has lasted long enough to tell its rate; batches make one second uneven by a tenth."""
         if age_s is None or age_s > _PAUSE_S:
             self._steady.clear()
         else:
@@ -91,7 +91,7 @@ class LidarReadings:
         return (count - before) * NS_PER_S / (now_ns - then_ns)
 
     def _rate(self, newest_ns: int, good: int, by_status: float) -> float:
-        """Packets per second by their own times: by those of two statuses it would be off by what one look at the socket brings."""
+        """Packets per second by their own times; the times of two statuses would add an error of one poll's packets."""
         (then_ns, before), self._newest = self._newest, (newest_ns, good)
         if not then_ns or newest_ns <= then_ns:
             return by_status
@@ -194,7 +194,7 @@ def clock_status(sync: ClockSync, wall_minus_log_ns: int) -> ClockStatus:
 
 
 class Endurance:
-    """How long the disk lasts, by what the log took of it over the last minute."""
+    """How long the disk lasts at the last minute's rate."""
 
     def __init__(self) -> None:
         self._marks: deque[tuple[float, int]] = deque(maxlen=61)

@@ -1,10 +1,11 @@
-"""The flight log's writer: a bounded backlog that never makes a receiver wait, and segments synced to the disk twice a second.
+"""The flight log's writer: a bounded backlog on which no receiver waits, and segments synced to disk twice a second.
 
-A segment that somebody deleted, a folder that is gone, a disk that fails or turns read-only: the segment is given up, and recording begins
-anew, elsewhere if the configuration names another folder. What comes meanwhile waits in the backlog.
+A segment that somebody deleted, a folder that is gone, a disk that fails or turns read-only: the segment is given up,
+and recording begins anew, in another folder if the configuration names one. Data that arrive meanwhile wait in the
+backlog.
 
-It watches the space that is left. Below a floor the lidar is refused and the rest goes on; below a quarter of that the log is closed
-well and everything is refused, until there is room again.
+It watches the free space. Below a floor it refuses the lidar, and everything else goes on. Below a quarter of that
+floor it closes the log properly and refuses everything, until there is room again.
 """
 
 import contextlib
@@ -167,17 +168,17 @@ class Recorder(Worker):
         return self.backlog.put(topic, log_time_ns, data, vital)
 
     def handed_over(self) -> None:
-        """Hear that all there is for now is in the backlog: where a sync is nearly due, it is best done now."""
+        """Note that everything received so far is in the backlog: if a sync is nearly due, do it now."""
         if time.monotonic_ns() >= self.counts.last_sync_ns + self._sync_ns * _NEARLY[0] // _NEARLY[1]:
             self._sync_soon = True
             self.backlog.pressing.set()
 
     def rotate(self) -> None:
-        """Ask for a new segment; soon, and not a message is lost for it."""
+        """Ask for a new segment soon; no message is lost."""
         self._rotation_asked.set()
 
     def work(self) -> None:
-        """Write and sync until asked to stop; what is in the backlog then is still written."""
+        """Write and sync until asked to stop; the backlog is still written then."""
         try:
             while not self.stopping:
                 self._go_round()
@@ -218,7 +219,7 @@ class Recorder(Worker):
             self._rotate()
 
     def _write_until(self, end_ns: int | None) -> None:
-        """Write the backlog; not beyond a time of the monotonic clock [ns] even if more and more comes."""
+        """Write the backlog, but not beyond a time of the monotonic clock [ns], even if more keeps arriving."""
         begin_ns = time.monotonic_ns()
         if self._segment is None and self._has_room and not self.stopping:
             return  # a new segment is tried soon: the backlog holds what comes until then
@@ -251,7 +252,7 @@ class Recorder(Worker):
     def _rotate(self) -> None:
         """Go on in a new segment, and close the old one beside the recording.
 
-        Closing takes four syncs or more. Were they waited for, a power cut meanwhile would cost what came since the sync before.
+        Closing takes four syncs or more. Waiting for them would lengthen what a power cut loses.
         """
         old, self._segment = self._segment, None
         drops, self._told_drops = self._drops() - self._told_drops, self._drops()
@@ -360,7 +361,7 @@ class Recorder(Worker):
     # Space --------------------------------------------------------------------------------------------------------
 
     def _until_full(self, step: Callable[[], None]) -> None:
-        """Do something that writes; a disk that is full or fails ends the segment and nothing else."""
+        """Run something that writes; a disk that is full or fails ends the segment and nothing else."""
         try:
             step()
         except OSError as error:
@@ -372,7 +373,7 @@ class Recorder(Worker):
             self.counts.last_sync_ns = time.monotonic_ns()
 
     def _stop_for_space(self) -> None:
-        """The disk is full, whatever it said before."""
+        """The disk is full, whatever its free space said before."""
         self._set_space(Space.FULL)
         self._retry_ns = time.monotonic_ns() + _RETRY_NS
         self.counts.last_sync_ns = time.monotonic_ns()
@@ -400,7 +401,7 @@ class Recorder(Worker):
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Whether a disk is full, which is no failure of it."""
+    """Whether the disk is full, as opposed to failed."""
     return isinstance(error, OSError) and error.errno in _FULL
 
 

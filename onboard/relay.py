@@ -1,8 +1,9 @@
-"""Live downlink: what is received goes to the ground as well, as UDP, so that a viewer or another swathd shows the flight as it happens.
+"""Live downlink: what is received also goes to the ground by UDP, for a viewer or another swathd.
 
-It may only ever lose its own: the receivers leave what they have in a bounded queue and go on, this thread sends without waiting,
-and what the link does not take within half a second is dropped, oldest first, and counted. The rate cap paces it too: a batch of
-0.1 s goes out over that time and not at once. It is no worker that the daemon depends on.
+It may only ever lose its own data. The receivers put messages into a bounded queue and go on. This thread sends
+without waiting; what the link does not take within half a second is dropped, oldest first, and counted. The rate
+limit also does the pacing: a batch of 0.1 s is sent over that time and not at once. The daemon does not depend on
+this thread.
 """
 
 import errno

@@ -17,7 +17,7 @@ from onboard import logfolder
 from onboard.logfolder import READ_ONLY, Entry, sync_directory
 
 _CHUNK_BYTES: Final = 3 << 19
-"""A little more than comes between two syncs, so that these close the chunks: one each, and little is lost with one."""
+"""A little more than arrives between two syncs, so that each sync closes one chunk, and little is lost with one."""
 
 
 _IOV_MAX: Final = 1024
@@ -25,7 +25,7 @@ _IOV_MAX: Final = 1024
 
 
 class _HashedFile:
-    """An unbuffered file with the checksum of what was written to it: what the disk refuses is refused at once, to the byte."""
+    """An unbuffered file with the checksum of what was written to it: a write that the disk refuses fails at once, to the byte."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,4 +1,4 @@
-"""What a lidar's packets tell of how it is set: speed, field of view, return mode, and the rate that follows from them. Pure."""
+"""The lidar's settings, inferred from its packets: speed, field of view, return mode, and the expected rate. Pure."""
 
 from dataclasses import dataclass
 from itertools import pairwise

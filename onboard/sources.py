@@ -27,7 +27,7 @@ Chunk = tuple[int, bytes]
 
 
 class Source(ABC):
-    """Where a link's bytes come from, and go to."""
+    """Where a link's bytes come from and go to."""
 
     pause_s: float
 

@@ -1,7 +1,8 @@
-"""Log time: the wall clock at the start, carried on by the monotonic clock, so that it never steps inside a log.
+"""Log time: the wall clock at the start, continued by the monotonic clock, so that it never steps inside a log.
 
-The kernel stamps packets with the wall clock, which may be set while we record (no clock on the board, then GPS or NTP arrives).
-Each poll therefore notes how the wall clock stands to the monotonic one, and stamps are put on log time by that difference.
+The kernel stamps packets with the wall clock, which may be set during recording (no clock on the board, then GPS or
+NTP arrives). Each poll therefore notes the difference between wall clock and monotonic clock, and stamps are
+converted to log time with it.
 """
 
 import time
@@ -35,7 +36,7 @@ class Clocks(NamedTuple):
 
 
 def read_clocks() -> Clocks:
-    """Read both clocks at one instant, as nearly as a busy machine lets us."""
+    """Read both clocks at one instant, as nearly as a busy machine allows."""
     best: tuple[int, Clocks] | None = None
     for _ in range(5):
         before_ns = time.monotonic_ns()
@@ -109,7 +110,7 @@ def stepped_offset_ns(stamps_ns: npt.NDArray[np.int64], before: Clocks, now: Clo
     """How far the wall clock was from the monotonic one at each stamp [ns], shape (n,) or one for all.
 
     Where the clock was stepped between two polls, the step lies between two neighbours of the row (poll before, stamps, this poll);
-    it is put where taking it away leaves the row smoothest.
+    it is placed where removing it leaves the row smoothest.
     """
     step_ns = now.offset_ns - before.offset_ns
     if abs(step_ns) <= STEP_NS:
@@ -127,7 +128,7 @@ class ClockWatch:
     ----------
     log_time : LogTime
     read : callable
-        Reads the clocks; a test's own here makes time what it likes.
+        Reads the clocks; a test may pass clocks of its own.
     boottime : callable
         Reads the boot clock [ns].
     """

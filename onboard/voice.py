@@ -1,4 +1,4 @@
-"""Our own words on a MAVLink link: frames of the companion computer, in the version of MAVLink that the autopilot speaks."""
+"""Our own messages on a MAVLink link: frames of the companion computer, in the autopilot's version of MAVLink."""
 
 from typing import Final
 

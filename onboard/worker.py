@@ -1,4 +1,4 @@
-"""A thread that must make progress: it says when it does, and its death is told."""
+"""A thread that must make progress: it reports progress, and its death is noticed."""
 
 import logging
 import threading
@@ -17,7 +17,7 @@ class Worker(threading.Thread, ABC):
     Attributes
     ----------
     progress_ns : int
-        When it last said that it gets on [ns of the monotonic clock].
+        When it last reported progress [ns of the monotonic clock].
     failure : str or None
         One sentence, once it has died.
     """
@@ -38,7 +38,7 @@ class Worker(threading.Thread, ABC):
         return self._stop_asked.is_set()
 
     def progress(self) -> None:
-        """Say that it gets on."""
+        """Report progress."""
         self.progress_ns = time.monotonic_ns()
 
     def stop(self, timeout_s: float = 10.0) -> None:

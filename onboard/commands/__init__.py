@@ -1,1 +1,1 @@
-"""Commands of `swathd` beside recording; each module has HELP, add_arguments(parser) and run(options) -> exit code."""
+"""Commands of `swathd` other than recording; each has HELP, add_arguments(parser) and run(options) -> exit code."""

@@ -1,4 +1,4 @@
-"""Asking before something is changed."""
+"""Asks before something is changed."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""`swathd check`: everything that must be there before a flight, tried, each failure with its remedy."""
+"""`swathd check`: tests everything that is needed before a flight; each failure comes with its remedy."""
 
 import argparse
 import json

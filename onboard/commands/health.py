@@ -1,4 +1,4 @@
-"""`swathd health`: what the status file says, judged. It is asked over SSH, so it loads nothing that takes time."""
+"""`swathd health`: the verdict on the status file. It is run over SSH, so it loads nothing that takes time."""
 
 import argparse
 import json
@@ -70,7 +70,7 @@ def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
         content = path.read_text(encoding="utf-8")
         status = health.from_json(content, str(path))
     except (OSError, UnicodeDecodeError, SwathError) as error:
-        # not knowing is as bad as it gets, and a monitor reads the exit code
+        # an unknown state counts as critical, and a monitor reads the exit code
         reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
         if as_json:
             return Level.CRITICAL, json.dumps({"verdict": Level.CRITICAL.name, "findings": [reason]}, indent=1)

@@ -58,9 +58,9 @@ def _wanted(path: Path | None) -> "LidarSettings":
 
 
 def _refuse_if_armed(config: Path) -> None:
-    """UsageError where a running swathd knows that the vehicle is armed: a head that changes its speed is no scanner.
+    """UsageError where a running swathd knows that the vehicle is armed: a head that changes its speed cannot scan.
 
-    On the bench there may be no autopilot, nor a swathd: not knowing is no reason to refuse.
+    On the bench there may be no autopilot and no swathd: an unknown state is no reason to refuse.
     """
     import json
 

@@ -1,4 +1,4 @@
-"""`swathd uninstall`: what `swathd install` did, undone."""
+"""`swathd uninstall`: undoes `swathd install`."""
 
 import argparse
 from pathlib import Path
