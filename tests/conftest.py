@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,6 +18,10 @@ from hypothesis import HealthCheck, settings
 # no test judges by a clock, and so no example does
 settings.register_profile("swath", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("swath")
+
+# a shell starts background jobs deaf to Ctrl-C, and so would be every program that a test interrupts
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass(frozen=True)
