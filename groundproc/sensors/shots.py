@@ -133,10 +133,10 @@ class Shots:
         return replace(self, **arrays, gated=Gated())
 
     @property
-    def azimuth_rad(self) -> npt.NDArray[np.float32]:
+    def azimuth_rad(self) -> Array:
         """Azimuth at each shot's own instant, 0 to 2 pi, shape (n,). Computed when asked for: placing needs only `xyz_m`."""
-        azimuth = np.arctan2(self.xyz_m[:, 0], self.xyz_m[:, 1])
-        return np.asarray(np.where(azimuth < 0.0, azimuth + np.float32(2.0 * np.pi), azimuth), np.float32)
+        right, ahead = self.xyz_m[:, 0].astype(np.float64), self.xyz_m[:, 1].astype(np.float64)
+        return np.asarray(np.arctan2(right, ahead) % (2.0 * np.pi))
 
     @property
     def elevation_rad(self) -> Array:
@@ -147,7 +147,7 @@ class Shots:
 _ARRAYS: Final = tuple(field.name for field in fields(Shots) if field.name not in ("lasers", "gated"))
 
 
-def turns(azimuth_rad: npt.NDArray[np.float32], last_rad: float | None) -> npt.NDArray[np.int64]:
+def turns(azimuth_rad: Array, last_rad: float | None) -> npt.NDArray[np.int64]:
     """Where another turn of the scanner begins: the shots, shape (k,), that are first past straight behind.
 
     Parameters

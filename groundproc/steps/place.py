@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+from flightlog.errors import CoverageError, LogError
 from groundproc import geodesy
 from groundproc.cloud import placing
 from groundproc.flight.lidar import lidar_of
@@ -69,7 +70,14 @@ def work(run: Run, folders: Folders) -> None:
             if each.name in folders:
                 own = replace(context, folder=folders[each.name])
                 sinks += stack.enter_context(streamed([each], own))
-        placed = placing.place(seen, made.trajectory, made.mount, projection, sinks)
+        try:
+            placed = placing.place(seen, made.trajectory, made.mount, projection, sinks)
+        except CoverageError:
+            if tally.packets:
+                raise
+            raise LogError(
+                f"{run.readers[0].path}: no lidar packets in the log, so that there is nothing to place"
+            ) from None
     if WHOLE in folders:
         _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed)
 

@@ -51,7 +51,7 @@ def test_the_kernels_of_this_version_are_hashed_with_their_constants() -> None:
     root = Path(kernelcache.__file__).parent.parent
     found = dict(kernelcache.sources(root))
     for name in (
-        "groundproc/estimation/odometry/odometry.py",
+        "groundproc/estimation/odometry/state.py",
         "groundproc/numerics/rotations.py",
         "flightlog/constants.py",
     ):

@@ -38,6 +38,7 @@ OTHERS: dict[str, object] = {
     "geoid": "29.35",
     "fov_deg": [0.0, 360.0],
     "pose_grid_ms": 10.0,
+    "products": ["cloud.laz"],
 }
 """Values of options that are not seen from their defaults and bounds."""
 

@@ -268,7 +268,8 @@ def test_what_was_heard_three_seconds_ago_is_no_word_on_whether_it_is_armed(
             link.refuse_if_armed()
         board.armed = False
         before = link._heartbeat_ns
-        link._until(lambda: link._heartbeat_ns > before and not link._life.armed, 90.0)
+        link._until(lambda: link._heartbeat_ns > before and link._life.armed(link._heartbeat_ns) is False, 90.0)
+        assert link._life.armed(link._heartbeat_ns) is False
         board.mute = True
         link._until(lambda: False, 0.6)  # what it has said is read
         monkeypatch.setattr(parameter_link, "_HEARTBEAT_S", 0.6)

@@ -16,8 +16,9 @@ from groundproc import progress
 from groundproc.estimation import ins
 from groundproc.field.madeup import ROOM_M, write_flight
 from groundproc.flight import autopilot
-from groundproc.sensors import hdl32e as decoder
-from groundproc.sensors.hdl32e import Gate
+from groundproc.sensors import firings
+from groundproc.sensors.hdl32e import LIDAR
+from groundproc.sensors.shots import Gate
 
 
 @pytest.mark.parametrize("mode", [ReturnMode.STRONGEST, ReturnMode.DUAL])
@@ -31,7 +32,7 @@ def test_the_made_up_flight_is_one_of_an_hdl_32e_in_a_room(tmp_path: Path, mode:
     assert hdl32e.is_data(packets["data"]).all()
     assert len(packets) == -(-500_000_000 // hdl32e.packet_ns(mode))
     assert (np.diff(records.receive_time_ns(packets)) == hdl32e.packet_ns(mode)).all()
-    shots = decoder.decode(packets, records.receive_time_ns(packets), Gate())
+    shots = firings.decode(LIDAR.firing, packets, records.receive_time_ns(packets), Gate(), LIDAR.lasers)
     # a second return that is the first once more is no return
     assert len(shots.time_ns) == len(packets) * len(set(hdl32e.firing_index(mode))) * hdl32e.LASERS
     # as far as the walls, from somewhere within
