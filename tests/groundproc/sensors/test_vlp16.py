@@ -16,7 +16,7 @@ from flightlog import records
 from flightlog.logfile import LogReader, LogWriter
 from groundproc import sensors
 from groundproc.cli import main
-from groundproc.cloud import las
+from groundproc.cloud.gpstime import gps_time_s
 from groundproc.geodesy import Projection, projected_crs
 from groundproc.sensors.shots import Gate
 from groundproc.trajectory.table import read_trajectory
@@ -143,7 +143,7 @@ def test_a_flight_with_it_is_processed_by_receive_times(plain_flight: Any, tmp_p
     trajectory = read_trajectory(out / "trajectory.csv")
     some = slice(None, None, 997)
     utc_ns = trajectory.time_ns[0] + np.rint(
-        (np.asarray(cloud.gps_time)[some] - las.gps_time_s(trajectory.time_ns[:1])[0]) * 1e9
+        (np.asarray(cloud.gps_time)[some] - gps_time_s(trajectory.time_ns[:1])[0]) * 1e9
     ).astype(np.int64)
     poses, known = trajectory.where_covered(utc_ns)
     centre = Projection(trajectory.frame, projected_crs(quality["crs"]["epsg"])).exact(poses.position_m[known])
