@@ -5,7 +5,7 @@
 in column form. `project` puts local coordinates into a projected CRS.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,8 @@ _PIECE: Final = 1 << 16
 """Shots for which every pose is asked at once: bounds the memory."""
 _LANE: Final = 64
 """Shots placed side by side: as arrays of single coordinates, the compiler makes four or eight of them one."""
+_FEW: Final = 1 << 14
+"""Poses that are asked for stretch by stretch even where fewer shots lie within them."""
 _MEMORY: Final = Pool()
 
 
@@ -93,12 +95,14 @@ def _place_stretches(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Ar
 
     Gives which ones are not covered.
     """
-    first, knots, begin = _stretches(shots.time_ns)
-    poses, known = sensor_poses(knots * STRETCH_NS, trajectory, mount)
-    whole = known[begin] & known[begin + 1]
-    _place(shots.time_ns, shots.xyz_m, _Stretches(first, knots[begin] * STRETCH_NS, begin, whole), poses, xyz)
-    edge = np.empty(0, np.int64) if whole.all() else np.flatnonzero(~np.repeat(whole, np.diff(first)))
-    return _place_each(shots, trajectory, mount, xyz, edge)
+    if not len(shots):
+        return np.empty(0, np.int64)
+    first, last = (int(time_ns) // STRETCH_NS for time_ns in shots.time_ns[[0, -1]])
+    if last - first > max(len(shots), _FEW):
+        return _place_each(shots, trajectory, mount, xyz, np.arange(len(shots)))
+    poses, known = sensor_poses(np.arange(first, last + 2) * STRETCH_NS, trajectory, mount)
+    left = _place(shots.time_ns, shots.xyz_m, first, poses, known, xyz)
+    return _place_each(shots, trajectory, mount, xyz, left)
 
 
 def _place_each(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array, chosen: Times) -> Times:
@@ -113,59 +117,6 @@ def _place_each(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array, 
         mats = poses[:, :9].reshape(-1, 3, 3)
         xyz[some] = np.einsum("nij,nj->ni", mats, shots.xyz_m[some].astype(np.float64)) + poses[:, 9:]
     return np.concatenate(missing)
-
-
-class _Stretches(NamedTuple):
-    """Runs of shots within one stretch.
-
-    Attributes
-    ----------
-    first : ndarray of int64, shape (m + 1,)
-        First shot of each run, and the end.
-    begin_ns : ndarray of int64, shape (m,)
-        When the stretch begins.
-    pose : ndarray of int64, shape (m,)
-        Which pose is that of its begin; the next is that of its end.
-    whole : ndarray of bool, shape (m,)
-        Whether both poses are known.
-    """
-
-    first: Times
-    begin_ns: Times
-    pose: Times
-    whole: Mask
-
-
-@njit(cache=True, nogil=True)
-def _stretches(time_ns: Any) -> Any:
-    """Cut times where they pass from one stretch to another.
-
-    Returns
-    -------
-    first : ndarray of int64, shape (m + 1,)
-        First shot of each run, and the end.
-    knots : ndarray of int64, shape (k,)
-        Begins and ends of the stretches, in their length since time 0. Neighbours share one.
-    begin : ndarray of int64, shape (m,)
-        Which knot is the begin of the run's stretch; the next is its end.
-    """
-    many = len(time_ns)
-    # as long as can be: pages never touched cost nothing
-    first, knots, begin = np.empty(many + 1, np.int64), np.empty(2 * many, np.int64), np.empty(many, np.int64)
-    runs, count, begin_ns = 0, 0, np.int64(0)
-    for i in range(many):
-        if runs and 0 <= time_ns[i] - begin_ns < STRETCH_NS:
-            continue
-        number = time_ns[i] // STRETCH_NS
-        begin_ns = number * STRETCH_NS
-        if not count or knots[count - 1] != number:
-            knots[count] = number
-            count += 1
-        knots[count] = number + 1
-        first[runs], begin[runs] = i, count - 1
-        count, runs = count + 1, runs + 1
-    first[runs] = many
-    return first[: runs + 1].copy(), knots[:count].copy(), begin[:runs].copy()
 
 
 @njit(cache=True, nogil=True)
@@ -188,9 +139,9 @@ def _sensor_poses(position: Any, quat: Any, mat_ins_lidar: Any, lever: Any, out:
             pose[9 + row] = position[i, row] + a * lever[0] + b * lever[1] + c * lever[2]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _place_lane(time_ns: Any, begin_ns: int, xyz: Any, a: Any, b: Any, lane: Any, out: Any) -> None:
-    """Place at most `_LANE` shots. `lane`, shape (7, _LANE), is room for time and coordinates before and after."""
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _place_lane(lane: Any, a: Any, b: Any, xyz: Any, out: Any) -> None:
+    """Apply (a + u b) to at most `_LANE` shots; `lane` has u in its row 0, and room for coordinates before and after in the others."""
     # scalars: the compiler then knows that no store changes them
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11 = (
         a[0],
@@ -220,34 +171,64 @@ def _place_lane(time_ns: Any, begin_ns: int, xyz: Any, a: Any, b: Any, lane: Any
         b[10],
         b[11],
     )
-    many = len(time_ns)
-    for i in range(many):
-        lane[0, i] = np.float64(np.int32(time_ns[i] - begin_ns))
-    for i in range(many):
+    for i in range(len(out)):
         lane[1, i], lane[2, i], lane[3, i] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-    for i in range(many):
+    for i in range(len(out)):
         u, x, y, z = lane[0, i], lane[1, i], lane[2, i], lane[3, i]
         lane[4, i] = a0 * x + a1 * y + a2 * z + a9 + u * (b0 * x + b1 * y + b2 * z + b9)
         lane[5, i] = a3 * x + a4 * y + a5 * z + a10 + u * (b3 * x + b4 * y + b5 * z + b10)
         lane[6, i] = a6 * x + a7 * y + a8 * z + a11 + u * (b6 * x + b7 * y + b8 * z + b11)
-    for i in range(many):
+    for i in range(len(out)):
         out[i, 0], out[i, 1], out[i, 2] = lane[4, i], lane[5, i], lane[6, i]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _place(time_ns: Any, xyz: Any, stretches: Any, poses: Any, out: Any) -> None:
-    """Place the shots of whole stretches: (a + u b) applied to each, u the time since the stretch began."""
+def _place(time_ns: Any, xyz: Any, first_stretch: int, poses: Any, known: Any, out: Any) -> Any:
+    """Place the shots of stretches whose poses at both ends are known; which ones are left, shape (k,).
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+    xyz : ndarray of float32, shape (n, 3)
+    first_stretch : int
+        Number of the first pose's stretch, counted from time 0.
+    poses : ndarray, shape (m, 12)
+        At the begins of stretches one after another.
+    known : ndarray of bool, shape (m,)
+    out : ndarray, shape (n, 3)
+    """
+    many = len(time_ns)
+    left, count = np.empty(many, np.int64), 0  # as long as can be: pages never touched cost nothing
     lane = np.empty((7, _LANE))
-    for run in range(len(stretches.whole)):
-        if not stretches.whole[run]:
-            continue
-        begin_ns, pose = stretches.begin_ns[run], stretches.pose[run]
-        a = poses[pose]
-        b = (poses[pose + 1] - a) * (1.0 / STRETCH_NS)
-        end = stretches.first[run + 1]
-        for first in range(stretches.first[run], end, _LANE):
-            last = min(first + _LANE, end)
-            _place_lane(time_ns[first:last], begin_ns, xyz[first:last], a, b, lane, out[first:last])
+    pose, begin_ns, whole = 0, np.int64(0), False
+    begin, first = np.empty(12), 0
+    drift = np.empty(12)
+    while first < many:
+        if first == 0 or not 0 <= time_ns[first] - begin_ns < STRETCH_NS:
+            number = time_ns[first] // STRETCH_NS
+            begin_ns, pose = number * STRETCH_NS, number - first_stretch
+            whole = 0 <= pose < len(poses) - 1 and known[pose] and known[pose + 1]
+            if whole:
+                for i in range(12):
+                    begin[i], drift[i] = poses[pose, i], (poses[pose + 1, i] - poses[pose, i]) * (1.0 / STRETCH_NS)
+        times, strangers = time_ns[first : first + _LANE], 0
+        for i in range(len(times)):
+            since_ns = times[i] - begin_ns
+            strangers += not 0 <= since_ns < STRETCH_NS
+            lane[0, i] = np.int32(since_ns)
+        last = min(first + _LANE, many)
+        if strangers:
+            last = first + 1
+            while 0 <= time_ns[last] - begin_ns < STRETCH_NS:
+                last += 1
+        if whole:
+            _place_lane(lane, begin, drift, xyz[first:last], out[first:last])
+        else:
+            for i in range(first, last):
+                left[count] = i
+                count += 1
+        first = last
+    return left[:count].copy()
 
 
 @njit(cache=True, nogil=True, fastmath=True)

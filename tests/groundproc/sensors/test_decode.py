@@ -108,7 +108,7 @@ def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
     assert (shots.laser == laser).all()
     assert (shots.returns == returns).all()
     np.testing.assert_allclose(shots.xyz_m, np.stack([x, y, z], axis=1), atol=1e-5)
-    off = (np.rad2deg(shots.azimuth_rad) * 100 - azimuth + 18_000) % 36_000 - 18_000
+    off = (np.rad2deg(shots.azimuth_rad.astype(np.float64)) * 100 - azimuth + 18_000) % 36_000 - 18_000
     assert np.abs(off).max() < 0.005  # float32 of up to 36000
 
 
