@@ -14,6 +14,7 @@ from numba import njit
 from flightlog.mount import Mount
 from groundproc.cloud.points import Dropped, Points
 from groundproc.geodesy import Polynomial
+from groundproc.numerics.memory import Pool
 from groundproc.sensors.shots import Shots
 from groundproc.trajectory.trajectory import HOLD, Trajectory
 
@@ -26,6 +27,11 @@ STRETCH_NS: Final = 500_000
 at 10 m/s^2 and 1000 deg/s^2 to 3e-7 m and 5e-7 rad; the chord of a turn at 300 deg/s shortens a vector by 9e-7 of its length."""
 _PIECE: Final = 1 << 16
 """Shots for which every pose is asked at once: bounds the memory."""
+_LANE: Final = 64
+"""Shots placed side by side: as arrays of single coordinates, the compiler makes four or eight of them one."""
+_FEW: Final = 1 << 14
+"""Poses that are asked for stretch by stretch even where fewer shots lie within them."""
+_MEMORY: Final = Pool()
 
 
 def georeference(shots: Shots, trajectory: Trajectory, mount: Mount) -> Points:
@@ -43,19 +49,21 @@ def georeference(shots: Shots, trajectory: Trajectory, mount: Mount) -> Points:
     Points
         Those that the trajectory covers.
     """
-    xyz = np.empty((len(shots), 3))
+    xyz = _MEMORY.empty((len(shots), 3), np.float64)
     if trajectory.interpolation == HOLD:
-        covered = _place_each(shots, trajectory, mount, xyz, np.arange(len(shots)))
+        missing = _place_each(shots, trajectory, mount, xyz, np.arange(len(shots)))
     else:
-        covered = _place_stretches(shots, trajectory, mount, xyz)
-    missing = len(shots) - int(np.count_nonzero(covered))
-    kept, xyz = (shots[covered], xyz[covered]) if missing else (shots, xyz)
-    gated = shots.gated
-    dropped = Dropped(missing, gated.outside_fov, gated.no_return, gated.out_of_range)
+        missing = _place_stretches(shots, trajectory, mount, xyz)
+    kept, gated = shots, shots.gated
+    if len(missing):
+        covered = np.ones(len(shots), np.bool_)
+        covered[missing] = False
+        kept, xyz = shots[covered], xyz[covered]
+    dropped = Dropped(len(missing), gated.outside_fov, gated.no_return, gated.out_of_range)
     columns = {
         "intensity": kept.intensity,
-        "return_number": kept.returns & 0x0F,
-        "number_of_returns": kept.returns >> 4,
+        "return_number": np.bitwise_and(kept.returns, 0x0F, out=_MEMORY.empty(len(kept), np.uint8)),
+        "number_of_returns": np.right_shift(kept.returns, 4, out=_MEMORY.empty(len(kept), np.uint8)),
         "laser": kept.laser,
         "range": kept.range_m,
     }
@@ -82,54 +90,33 @@ def project(xyz_m: Array, polynomial: Polynomial) -> None:
     _project(xyz_m, polynomial.centre_m, polynomial.coefficients)
 
 
-def _place_stretches(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array) -> Mask:
-    """Place shots with poses interpolated linearly within stretches; those at an edge of the coverage each with its own."""
-    first, slot = _stretches(shots.time_ns, STRETCH_NS)
-    poses, known = sensor_poses((slot[:, None] + np.array([0, 1])).ravel() * STRETCH_NS, trajectory, mount)
-    whole = known.reshape(-1, 2).all(axis=1)
-    _place(shots.time_ns, shots.xyz_m, first, slot, whole, poses.reshape(-1, 2, 12), STRETCH_NS, xyz)
-    covered = np.ones(len(shots), np.bool_)
-    if not whole.all():
-        edge = np.flatnonzero(~np.repeat(whole, np.diff(first)))
-        covered[edge] = _place_each(shots, trajectory, mount, xyz, edge)
-    return covered
+def _place_stretches(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array) -> Times:
+    """Place shots with poses interpolated linearly within stretches; those at an edge of the coverage each with its own.
+
+    Gives which ones are not covered.
+    """
+    if not len(shots):
+        return np.empty(0, np.int64)
+    first, last = (int(time_ns) // STRETCH_NS for time_ns in shots.time_ns[[0, -1]])
+    if last - first > max(len(shots), _FEW):
+        return _place_each(shots, trajectory, mount, xyz, np.arange(len(shots)))
+    poses, known = sensor_poses(np.arange(first, last + 2) * STRETCH_NS, trajectory, mount)
+    left = _place(shots.time_ns, shots.xyz_m, first, poses, known, xyz)
+    return _place_each(shots, trajectory, mount, xyz, left)
 
 
-def _place_each(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array, chosen: Times) -> Mask:
-    """Place chosen shots, shape (n,), each with a pose asked for; which of them are covered."""
-    covered = np.zeros(len(chosen), np.bool_)
+def _place_each(shots: Shots, trajectory: Trajectory, mount: Mount, xyz: Array, chosen: Times) -> Times:
+    """Place chosen shots, shape (n,), each with a pose asked for; which ones are not covered."""
+    missing = [np.empty(0, np.int64)]
     for start in range(0, len(chosen), _PIECE):
         some = chosen[start : start + _PIECE]
         poses, known = sensor_poses(shots.time_ns[some], trajectory, mount)
-        covered[start : start + _PIECE] = known
+        missing.append(some[~known])
         # poses outside the trajectory are no numbers to reckon with
         some, poses = some[known], poses[known]
         mats = poses[:, :9].reshape(-1, 3, 3)
         xyz[some] = np.einsum("nij,nj->ni", mats, shots.xyz_m[some].astype(np.float64)) + poses[:, 9:]
-    return covered
-
-
-@njit(cache=True, nogil=True)
-def _stretches(time_ns: Any, length_ns: int) -> Any:
-    """Cut times where they pass from one stretch to another.
-
-    Returns the first shot of each run, and the end, shape (m + 1,); and the number of its stretch, counted from time 0, shape (m,).
-    """
-    many = len(time_ns)
-    first, slot = (
-        np.empty(many + 1, np.int64),
-        np.empty(many, np.int64),
-    )  # as long as can be: pages never touched cost nothing
-    count, start, end = 0, np.int64(0), np.int64(0)
-    for i in range(many):
-        if not start <= time_ns[i] < end:
-            number = time_ns[i] // length_ns
-            start = number * length_ns
-            end = start + length_ns
-            first[count], slot[count] = i, number
-            count += 1
-    first[count] = many
-    return first[: count + 1].copy(), slot[:count].copy()
+    return np.concatenate(missing)
 
 
 @njit(cache=True, nogil=True)
@@ -152,28 +139,96 @@ def _sensor_poses(position: Any, quat: Any, mat_ins_lidar: Any, lever: Any, out:
             pose[9 + row] = position[i, row] + a * lever[0] + b * lever[1] + c * lever[2]
 
 
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _place_lane(lane: Any, a: Any, b: Any, xyz: Any, out: Any) -> None:
+    """Apply (a + u b) to at most `_LANE` shots; `lane` has u in its row 0, and room for coordinates before and after in the others."""
+    # scalars: the compiler then knows that no store changes them
+    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11 = (
+        a[0],
+        a[1],
+        a[2],
+        a[3],
+        a[4],
+        a[5],
+        a[6],
+        a[7],
+        a[8],
+        a[9],
+        a[10],
+        a[11],
+    )
+    b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11 = (
+        b[0],
+        b[1],
+        b[2],
+        b[3],
+        b[4],
+        b[5],
+        b[6],
+        b[7],
+        b[8],
+        b[9],
+        b[10],
+        b[11],
+    )
+    for i in range(len(out)):
+        lane[1, i], lane[2, i], lane[3, i] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+    for i in range(len(out)):
+        u, x, y, z = lane[0, i], lane[1, i], lane[2, i], lane[3, i]
+        lane[4, i] = a0 * x + a1 * y + a2 * z + a9 + u * (b0 * x + b1 * y + b2 * z + b9)
+        lane[5, i] = a3 * x + a4 * y + a5 * z + a10 + u * (b3 * x + b4 * y + b5 * z + b10)
+        lane[6, i] = a6 * x + a7 * y + a8 * z + a11 + u * (b6 * x + b7 * y + b8 * z + b11)
+    for i in range(len(out)):
+        out[i, 0], out[i, 1], out[i, 2] = lane[4, i], lane[5, i], lane[6, i]
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def _place(time_ns: Any, xyz: Any, first: Any, slot: Any, whole: Any, ends: Any, length_ns: int, out: Any) -> None:
-    """Place the shots of whole stretches: (a + u b) applied to each, u the time since the stretch began."""
-    per_ns = 1.0 / length_ns
-    for run in range(len(slot)):
-        if not whole[run]:
-            continue
-        begin_ns = slot[run] * length_ns
-        p, b = ends[run, 0], (ends[run, 1] - ends[run, 0]) * per_ns
-        # scalars and slices: the compiler then knows that no store changes them and that no index is negative
-        a0, a1, a2, a3, a4, a5 = p[0], p[1], p[2], p[3], p[4], p[5]
-        a6, a7, a8, a9, a10, a11 = p[6], p[7], p[8], p[9], p[10], p[11]
-        b0, b1, b2, b3, b4, b5 = b[0], b[1], b[2], b[3], b[4], b[5]
-        b6, b7, b8, b9, b10, b11 = b[6], b[7], b[8], b[9], b[10], b[11]
-        span = slice(first[run], first[run + 1])
-        times, sensor, world = time_ns[span], xyz[span], out[span]
+def _place(time_ns: Any, xyz: Any, first_stretch: int, poses: Any, known: Any, out: Any) -> Any:
+    """Place the shots of stretches whose poses at both ends are known; which ones are left, shape (k,).
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+    xyz : ndarray of float32, shape (n, 3)
+    first_stretch : int
+        Number of the first pose's stretch, counted from time 0.
+    poses : ndarray, shape (m, 12)
+        At the begins of stretches one after another.
+    known : ndarray of bool, shape (m,)
+    out : ndarray, shape (n, 3)
+    """
+    many = len(time_ns)
+    left, count = np.empty(many, np.int64), 0  # as long as can be: pages never touched cost nothing
+    lane = np.empty((7, _LANE))
+    pose, begin_ns, whole = 0, np.int64(0), False
+    begin, first = np.empty(12), 0
+    drift = np.empty(12)
+    while first < many:
+        if first == 0 or not 0 <= time_ns[first] - begin_ns < STRETCH_NS:
+            number = time_ns[first] // STRETCH_NS
+            begin_ns, pose = number * STRETCH_NS, number - first_stretch
+            whole = 0 <= pose < len(poses) - 1 and known[pose] and known[pose + 1]
+            if whole:
+                for i in range(12):
+                    begin[i], drift[i] = poses[pose, i], (poses[pose + 1, i] - poses[pose, i]) * (1.0 / STRETCH_NS)
+        times, strangers = time_ns[first : first + _LANE], 0
         for i in range(len(times)):
-            u = np.float64(np.int32(times[i] - begin_ns))
-            x, y, z = np.float64(sensor[i, 0]), np.float64(sensor[i, 1]), np.float64(sensor[i, 2])
-            world[i, 0] = a0 * x + a1 * y + a2 * z + a9 + u * (b0 * x + b1 * y + b2 * z + b9)
-            world[i, 1] = a3 * x + a4 * y + a5 * z + a10 + u * (b3 * x + b4 * y + b5 * z + b10)
-            world[i, 2] = a6 * x + a7 * y + a8 * z + a11 + u * (b6 * x + b7 * y + b8 * z + b11)
+            since_ns = times[i] - begin_ns
+            strangers += not 0 <= since_ns < STRETCH_NS
+            lane[0, i] = np.int32(since_ns)
+        last = min(first + _LANE, many)
+        if strangers:
+            last = first + 1
+            while 0 <= time_ns[last] - begin_ns < STRETCH_NS:
+                last += 1
+        if whole:
+            _place_lane(lane, begin, drift, xyz[first:last], out[first:last])
+        else:
+            for i in range(first, last):
+                left[count] = i
+                count += 1
+        first = last
+    return left[:count].copy()
 
 
 @njit(cache=True, nogil=True, fastmath=True)

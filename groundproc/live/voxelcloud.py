@@ -1,7 +1,7 @@
 """The live cloud: one point for each voxel that was hit, in the order of the first hits, in bounded memory."""
 
 import threading
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,42 @@ Array = npt.NDArray[np.float64]
 COARSER: Final = 1.5
 """When the cloud is full its voxels grow by this."""
 _FIRST_ROWS: Final = 1 << 16
+
+
+class _Cells(NamedTuple):
+    """The kept points, and the table that finds them by voxel.
+
+    Attributes
+    ----------
+    table : ndarray of int32, shape (2^k,)
+        Number of a point by the hash of its voxel; -1 where there is none.
+    keys : ndarray of int64, shape (rows,)
+        Key of each point's voxel.
+    xyz, intensity, time_ns : ndarray, shape (rows, 3) and (rows,)
+        As `_Placed`.
+    """
+
+    table: npt.NDArray[np.int32]
+    keys: npt.NDArray[np.int64]
+    xyz: npt.NDArray[np.float32]
+    intensity: npt.NDArray[np.uint8]
+    time_ns: npt.NDArray[np.int64]
+
+
+class _Placed(NamedTuple):
+    """Points to be added.
+
+    Attributes
+    ----------
+    xyz : ndarray of float32, shape (n, 3)
+        In the local frame [m].
+    intensity : ndarray of uint8, shape (n,)
+    time_ns : ndarray of int64, shape (n,)
+    """
+
+    xyz: npt.NDArray[np.float32]
+    intensity: npt.NDArray[np.uint8]
+    time_ns: npt.NDArray[np.int64]
 
 
 class VoxelCloud:
@@ -60,17 +96,18 @@ class VoxelCloud:
         """
         world = np.empty((len(time_ns), 3), np.float32)
         _place(time_ns, xyz_m, path.start_ns, path.quat, path.position_m, world)
-        self._insert(world, intensity, time_ns)
+        self._insert(_Placed(world, intensity, time_ns))
 
-    def _insert(self, world: Any, intensity: Any, time_ns: Any) -> None:
+    def _cells(self) -> _Cells:
+        return _Cells(self._table, self._keys, self._xyz, self._intensity, self._time_ns)
+
+    def _insert(self, points: _Placed) -> None:
         start = 0
         with self.lock:
-            while start < len(world):
-                start, self.count = _insert(
-                    self._table, self._keys, self._xyz, self._intensity, self._time_ns, self.count, world, intensity,
-                    time_ns, start, 1.0 / self.voxel_m, min(len(self._keys), self.most),
-                )  # fmt: skip
-                if start < len(world):
+            while start < len(points.xyz):
+                most = min(len(self._keys), self.most)
+                start, self.count = _insert(self._cells(), self.count, points, start, 1.0 / self.voxel_m, most)
+                if start < len(points.xyz):
                     self._make_room()
 
     def _make_room(self) -> None:
@@ -86,13 +123,9 @@ class VoxelCloud:
             self.generation += 1
         size = 1 << int(np.ceil(np.log2(4 * len(self._keys))))
         self._table = np.full(size, -1, np.int32)
-        xyz, intensity, time_ns = (
-            column[: self.count].copy() for column in (self._xyz, self._intensity, self._time_ns)
-        )
-        _, self.count = _insert(
-            self._table, self._keys, self._xyz, self._intensity, self._time_ns, 0, xyz, intensity, time_ns, 0,
-            1.0 / self.voxel_m, len(self._keys),
-        )  # fmt: skip
+        many = slice(self.count)
+        kept = _Placed(self._xyz[many].copy(), self._intensity[many].copy(), self._time_ns[many].copy())
+        _, self.count = _insert(self._cells(), 0, kept, 0, 1.0 / self.voxel_m, len(self._keys))
 
     def part(self, generation: int, start: int, most: int) -> tuple[int, int, Any, Any]:
         """Generation, number of the first, positions (n, 3) and intensities (n,) of points from a number on.
@@ -129,11 +162,10 @@ def _place(time_ns: Any, xyz: Any, start_ns: int, quat: Any, position: Any, worl
 
 
 @njit(cache=True, nogil=True)
-def _insert(
-    table: Any, keys: Any, out_xyz: Any, out_intensity: Any, out_time: Any, count: int, xyz: Any, intensity: Any,
-    time_ns: Any, start: int, per_m: float, most: int,
-) -> Any:  # fmt: skip
+def _insert(cells: Any, count: int, points: Any, start: int, per_m: float, most: int) -> Any:
     """Add points from `start` on; gives where it stopped for want of room, and the new count."""
+    table, keys, out_xyz, out_intensity, out_time = cells
+    xyz, intensity, time_ns = points
     mask = len(table) - 1
     for n in range(start, len(xyz)):
         key = voxel_key(np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2]), per_m)

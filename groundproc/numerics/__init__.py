@@ -5,6 +5,7 @@ splines     uniform cubic B-splines
 robust      the sigma that a median tells, and weights of losses that bend
 voxelhash   keys of voxels, and points sorted by them
 planes      planes through the second moments of points
+memory      arrays whose memory is used again
 planerows   distances from such planes as rows of a least-squares problem, the planes solved for within
 
 Kernels take few arguments: what belongs together is a named tuple of arrays, whose fields have shape, dtype and unit in its docstring. A

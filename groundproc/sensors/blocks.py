@@ -6,7 +6,7 @@ stamp in microseconds past the hour, the return mode and the product. Sources: H
 
 import itertools
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -70,12 +70,29 @@ def by_mode(packets: Packets, time_ns: Times) -> Iterator[tuple[Packets, Times]]
             yield packets[a:b], time_ns[a:b]
 
 
-def limits(gate: Gate) -> tuple[float, float, int, int]:
-    """Window start and width [0.01 deg], least and largest range [2 mm], as the kernels want them."""
+class Limits(NamedTuple):
+    """A `Gate` in the units of the packets.
+
+    Attributes
+    ----------
+    start, width : float
+        Of the azimuth window [0.01 deg].
+    low, high : int
+        Least and largest range [2 mm], both included.
+    """
+
+    start: float
+    width: float
+    low: int
+    high: int
+
+
+def limits(gate: Gate) -> Limits:
+    """A gate as the kernels want it."""
     start, width = gate.window_deg()
     low = max(1, int(np.ceil(gate.min_range_m / RANGE_LSB_M - 1e-6)))
     high = min(65535, int(np.floor(gate.max_range_m / RANGE_LSB_M + 1e-6)))
-    return start * 100.0, width * 100.0, low, high
+    return Limits(start * 100.0, width * 100.0, low, high)
 
 
 def block_period_ns(packets: Packets) -> float | None:

@@ -35,10 +35,7 @@ def test_kernels_are_found() -> None:
 
 
 def test_no_kernel_has_more_parameters_than_one_can_keep_apart() -> None:
-    # the rooms of the sensors and of the live view are being rebuilt
-    waiting = ("sensors/", "cloud/georeference.py", "live/")
-    long = {name: len(parameters(node)) for name, node in kernels() if len(parameters(node)) > MOST}
-    assert {name: count for name, count in long.items() if not name.startswith(waiting)} == {}
+    assert {name: len(parameters(node)) for name, node in kernels() if len(parameters(node)) > MOST} == {}
 
 
 def test_the_factor_of_the_median_deviation_stands_in_one_place() -> None:
