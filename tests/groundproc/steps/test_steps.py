@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from groundproc.steps import ORDER
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.step import steps
 
-SWATH = Path(sys.executable).with_name("swath")
 PATIENCE_S = 300.0
 
 
@@ -265,15 +263,33 @@ def test_a_folder_that_holds_only_what_is_read_is_no_stranger(log: Path, tmp_pat
 # Interrupts -----------------------------------------------------------------------------------------------------------
 
 
+HELD = """
+import sys, time
+from dataclasses import replace
+from importlib import import_module
+from groundproc.cli import main
+
+module = import_module("groundproc.steps." + sys.argv[1])
+work = module.STEP.work
+
+def held(run, folders):
+    work(run, folders)
+    print("at work", flush=True)
+    time.sleep(600)
+
+module.STEP = replace(module.STEP, work=held)
+sys.exit(main(sys.argv[2:]))
+"""
+"""`swath`, but for one step that has written all of its outputs and does not end: a signal finds it at work however slow the machine."""
+
+
 def interrupted(log: Path, folder: Path, step: str, number: int) -> int:
-    """Run `swath process` for real and send it a signal when a step is at work; its exit code."""
-    command = [SWATH, "process", log, "--method", "ins", "-o", folder]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
-        end = time.monotonic() + PATIENCE_S
-        while not list((folder / INSIDE).glob(f".{step}.*.part")):
-            assert run.poll() is None, run.stderr and run.stderr.read()
-            assert time.monotonic() < end
-            time.sleep(0.001)
+    """Run `swath process` as a process of its own and send it a signal when a step is at work; its exit code."""
+    words = ["process", str(log), "--method", "ins", "-o", str(folder)]
+    with subprocess.Popen([sys.executable, "-c", HELD, step, *words], stdout=subprocess.PIPE) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == b"at work\n"
+        assert list((folder / INSIDE).glob(f".{step}.*.part"))
         run.send_signal(number)
         return run.wait(timeout=PATIENCE_S)
 
