@@ -44,6 +44,7 @@ from machine import busy_s
 ROUNDS: Final = 3
 FLIGHT: Final = "survey_fast_gyro"
 FLIGHT_S: Final = 60
+LOOK_S: Final = 0.05
 CORES: Final = len(os.sched_getaffinity(0))
 
 
@@ -59,14 +60,30 @@ class Run:
 
 
 def swath(*words: str | Path) -> tuple[float, float]:
-    """Run a command of swath; its CPU time [s] and highest resident memory [MB]."""
+    """Run a command of swath; its CPU time [s] and highest resident memory [MB].
+
+    The memory is read while it runs: what wait4 tells holds that of this program too, from before the exec.
+    """
     command = [Path(sys.executable).with_name("swath"), *words]
+    peak_kb = 0
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        _, status, usage = os.wait4(process.pid, 0)
+        while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+            peak_kb = max(peak_kb, resident_peak_kb(process.pid))
+            time.sleep(LOOK_S)
+        _, status, usage = ended
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{' '.join(map(str, command))}: exit code {process.returncode}")
-    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6
+    return usage.ru_utime + usage.ru_stime, peak_kb * 1024 / 1e6
+
+
+def resident_peak_kb(pid: int) -> int:
+    """Highest resident memory of a process so far [KiB]; 0 where it has just ended."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), 0)
 
 
 def compress(points: npt.NDArray[np.void], target: Path) -> tuple[float, float]:
