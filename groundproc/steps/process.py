@@ -103,7 +103,7 @@ def process(
             with Run(request, folder, progress) as run:
                 for step in steps()[: ORDER.index(until) + 1]:
                     _bring_up_to_date(step, run, ledger, force)
-        except Exception:
+        except Exception:  # raised again: whatever went wrong, a folder that held nothing is left so
             if was_empty:
                 ledger.forget_all()
             raise

@@ -141,17 +141,29 @@ class MotionGrid(Protocol):
     """
 
     @property
-    def start_ns(self) -> int: ...  # noqa: D102
+    def start_ns(self) -> int:
+        """Start of the grid [ns]."""
+
     @property
-    def rate_rad_s(self) -> Array: ...  # noqa: D102
+    def rate_rad_s(self) -> Array:
+        """Mean rates."""
+
     @property
-    def force_m_s2(self) -> Array: ...  # noqa: D102
+    def force_m_s2(self) -> Array:
+        """Mean specific forces."""
+
     @property
-    def known(self) -> npt.NDArray[np.bool_]: ...  # noqa: D102
+    def known(self) -> npt.NDArray[np.bool_]:
+        """Whether samples say it."""
+
     @property
-    def rate_density(self) -> float: ...  # noqa: D102
+    def rate_density(self) -> float:
+        """Noise of the rates."""
+
     @property
-    def force_density(self) -> float: ...  # noqa: D102
+    def force_density(self) -> float:
+        """Noise of the forces."""
+
     def __len__(self) -> int: ...
 
 

@@ -48,7 +48,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def register(name: str, method: Method) -> None:
         module = ModuleType(f"made_up_{name}")
-        module.METHOD = method  # type: ignore[attr-defined]
+        module.METHOD = method  # type: ignore[attr-defined] # a module made here has no such name
         monkeypatch.setitem(sys.modules, module.__name__, module)
         monkeypatch.setitem(METHODS, name, module.__name__)
 
