@@ -39,6 +39,10 @@ REGISTRY: Final[dict[str, Entry]] = {
     "pictures": Entry(
         "groundproc.products.pictures", "Pictures", "cloud_height.png, cloud_intensity.png: from above and from the south"
     ),
+    "dsm.tif": Entry("groundproc.products.dsm", "Dsm", "surface model: the highest point of each cell, 0.25 m"),
+    "intensity.tif": Entry("groundproc.products.intensity", "Intensity", "mean intensity by cell"),
+    "density.tif": Entry("groundproc.products.density", "Density", "points per square metre by cell"),
+    "hillshade.tif": Entry("groundproc.products.hillshade", "Hillshade", "surface model lit from the north-west"),
     "adjustment.png": Entry(
         "groundproc.products.adjustment_plot", "draw", "method adjusted: what it left over, and how well it knows what it estimated"
     ),

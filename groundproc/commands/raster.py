@@ -1,0 +1,47 @@
+"""`swath raster`: a Cloud-Optimized GeoTIFF of clouds of any origin, or what follows from the heights of another raster."""
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "make a raster of clouds: surface model, intensity, density, hillshade, any attribute"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument(
+        "clouds", nargs="+", type=Path, metavar="CLOUD",
+        help="LAS, LAZ or COPC files of one CRS; or one GeoTIFF of heights, for hillshade, local-relief and sky-view",
+    )  # fmt: skip
+    parser.add_argument(
+        "--what", default="dsm", metavar="NAME",
+        help="dsm, intensity, density, hillshade, local-relief, sky-view, or any attribute of the points; default: dsm",
+    )  # fmt: skip
+    parser.add_argument(
+        "--statistic", metavar="NAME", help="max, min, mean, median, sigma or count of the values in a cell; default: max of "
+        "heights, mean of others",
+    )  # fmt: skip
+    parser.add_argument("--cell", type=float, default=0.25, metavar="M", help="size of a cell [m]; default: 0.25")
+    parser.add_argument("--crs", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the raster, .tif")
+    parser.add_argument("--force", action="store_true", help="overwrite the output")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make the raster, with a progress bar on a terminal."""
+    from tqdm import tqdm
+
+    from groundproc.raster.work import Task, work
+
+    with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
+        made = work(
+            Task(
+                arguments.clouds, arguments.output, arguments.what, arguments.statistic, arguments.cell, arguments.crs,
+                arguments.force,
+            ),
+            bar.update,
+        )  # fmt: skip
+    for line in made.warnings:
+        print(f"swath: warning: {line}", file=sys.stderr)
+    print(f"{made.columns} x {made.rows} cells of {made.cell_m:g} m in {arguments.output}")
+    return 0

@@ -1,0 +1,177 @@
+"""Rasters as Cloud-Optimized GeoTIFF: tiled, compressed, with overviews, written block by block and read window by window."""
+
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.shutil import copy
+from rasterio.transform import from_origin
+
+from flightlog import __version__
+from flightlog.errors import CaptureError, SourceError
+from groundproc.raster.grid import Grid, Window
+
+BLOCK: Final = 512
+NO_DATA: Final = -9999.0
+"""Of rasters of floating numbers, as GDAL's own tools have it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """What one band holds.
+
+    Attributes
+    ----------
+    name, unit : str
+    dtype : str
+    no_data : float or None
+        Stored where there is no value; None: every cell has one.
+    resampling : str
+        How overviews are made: "average" for what varies smoothly, "nearest" for what may not be mixed.
+    """
+
+    name: str
+    unit: str = ""
+    dtype: str = "float32"
+    no_data: float | None = NO_DATA
+    resampling: str = "average"
+
+
+def write(
+    path: Path,
+    grid: Grid,
+    crs: pyproj.CRS | None,
+    band: Band,
+    block: Callable[[Window], npt.NDArray[Any]],
+) -> None:
+    """Write a raster of one band, a block at a time.
+
+    Parameters
+    ----------
+    path : Path
+        Written to in place: the caller writes aside. A temporary file lies beside it meanwhile.
+    grid : Grid
+    crs : pyproj.CRS or None
+    band : Band
+    block : callable
+        Gives the values of a window, shape (rows, columns), the first row in the north; NaN where there is none.
+
+    Raises
+    ------
+    SourceError
+        It cannot be written.
+    """
+    plain = path.with_name(f"{path.name}.plain")
+    profile = {
+        "driver": "GTiff", "width": grid.columns, "height": grid.rows, "count": 1, "dtype": band.dtype,
+        "nodata": band.no_data, "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "bigtiff": "IF_SAFER", "sparse_ok": True,
+    }  # fmt: skip
+    if crs is not None:
+        profile["crs"] = rasterio.crs.CRS.from_wkt(crs.to_wkt("WKT2_2019"))
+    try:
+        with rasterio.open(plain, "w", **profile) as file:
+            file.update_tags(TIFFTAG_SOFTWARE=f"swath {__version__}")
+            file.set_band_description(1, band.name)
+            if band.unit:
+                file.set_band_unit(1, band.unit)
+            for window in grid.blocks(BLOCK):
+                values = np.asarray(block(window))
+                if band.no_data is not None and values.dtype.kind == "f":
+                    values = np.where(np.isfinite(values), values, band.no_data)
+                file.write(values.astype(band.dtype), 1, window=_window(grid, window))
+        predictor = "3" if np.dtype(band.dtype).kind == "f" else "2"
+        copy(
+            plain, path, driver="COG", compress="DEFLATE", predictor=predictor, blocksize=BLOCK,
+            overview_resampling=band.resampling, bigtiff="IF_SAFER", num_threads="ALL_CPUS",
+        )  # fmt: skip
+    except (RasterioError, OSError) as error:
+        raise SourceError(f"{path}: cannot be written ({_sentence(error)})") from None
+    finally:
+        with contextlib.suppress(OSError):
+            plain.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """A raster file of one band on square cells that run north and east.
+
+    Attributes
+    ----------
+    path : Path
+    grid : Grid
+        Its first column and row are counted from the raster's own corner where the edges are no whole multiples of the cell.
+    west_m, north_m : float
+        Its corner.
+    crs : pyproj.CRS or None
+    file : rasterio.DatasetReader
+    """
+
+    path: Path
+    grid: Grid
+    west_m: float
+    north_m: float
+    crs: pyproj.CRS | None
+    file: Any
+
+    def window(self, window: Window) -> npt.NDArray[np.float32]:
+        """Values of a window, shape (rows, columns), the first row in the north; NaN where there is none, or outside.
+
+        Raises
+        ------
+        CaptureError
+            The file is damaged.
+        """
+        try:
+            read = self.file.read(
+                1, window=_window(self.grid, window), boundless=True, masked=True, out_dtype="float32"
+            )
+        except (RasterioError, OSError) as error:
+            raise CaptureError(f"{self.path}: is damaged ({_sentence(error)})") from None
+        return np.asarray(read.filled(np.nan), np.float32)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Raster]:
+    """A raster file.
+
+    Raises
+    ------
+    CaptureError
+        It cannot be read, is no raster, or its cells are not square or are turned.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            file = rasterio.open(path)
+    except (RasterioError, OSError) as error:
+        raise CaptureError(f"{path}: cannot be read as a raster ({_sentence(error)})") from None
+    with file:
+        transform = file.transform
+        if transform.is_identity or transform.b or transform.d or not np.isclose(transform.a, -transform.e, rtol=1e-6):
+            raise CaptureError(f"{path}: cells of {transform.a:g} x {-transform.e:g} found, expected squares, north up")
+        cell_m = float(transform.a)
+        column, row = round(transform.c / cell_m), round(transform.f / cell_m) - file.height
+        crs = None if file.crs is None else pyproj.CRS.from_wkt(file.crs.to_wkt())
+        grid = Grid(column, row, file.width, file.height, cell_m)
+        yield Raster(path, grid, float(transform.c), float(transform.f), crs, file)
+
+
+def _window(grid: Grid, window: Window) -> Any:
+    """A window in rasterio's terms: from the upper left corner."""
+    down = grid.row + grid.rows - window.row - window.rows
+    return rasterio.windows.Window(window.column - grid.column, down, window.columns, window.rows)
+
+
+def _sentence(error: BaseException) -> str:
+    """What an error of GDAL says, on one line."""
+    told = error.__cause__ or error
+    return " ".join(str(told).split()) or type(error).__name__
