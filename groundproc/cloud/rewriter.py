@@ -26,6 +26,8 @@ class Rewriter:
     ----------
     cloud : Cloud
     path : Path
+    compressed : bool
+        LAZ; else LAS.
 
     Raises
     ------
@@ -35,7 +37,7 @@ class Rewriter:
         The new file cannot be written.
     """
 
-    def __init__(self, cloud: Cloud, path: Path) -> None:
+    def __init__(self, cloud: Cloud, path: Path, compressed: bool = True) -> None:
         self.path, self.name = path, cloud.path
         with opened(cloud.path) as reader:
             header = laspy.LasHeader(version=reader.header.version, point_format=reader.header.point_format)
@@ -52,7 +54,7 @@ class Rewriter:
             self._evlrs = [v for v in (reader.evlrs or []) if v.user_id not in _NOT_KEPT]
         try:
             self._las = laspy.open(
-                path, mode="w", header=header, laz_backend=laspy.LazBackend.LazrsParallel, do_compress=True
+                path, mode="w", header=header, laz_backend=laspy.LazBackend.LazrsParallel, do_compress=compressed
             )
         except OSError as error:
             raise SourceError(f"{path}: cannot be written ({error.strerror})") from None

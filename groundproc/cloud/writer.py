@@ -1,32 +1,25 @@
-"""Clouds as LAZ: LAS 1.4, point format 6 to 8, made from the table of dimensions and compressed on all cores."""
+"""Clouds as LAZ, compressed on all cores."""
 
 import queue
 import threading
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import laspy
 import numpy as np
 import numpy.typing as npt
 import pyproj
-from laspy.vlrs.known import WktCoordinateSystemVlr
-from numba import njit
 
-from flightlog import __version__
 from flightlog.errors import SourceError
-from groundproc.cloud.dimensions import BIT_FIELDS, Dimension, in_order
-from groundproc.cloud.gpstime import gps_time_s
+from groundproc.cloud.packer import Packer
 from groundproc.cloud.points import Points
 
-SCALE_M: Final = 0.001
 BUFFER_POINTS: Final = 20 * 50_000
 """lazrs compresses 50,000 points at a time on each core: a call of many such leaves no core idle at its end."""
 _BUFFERS: Final = 3
 """One is filled while another is compressed and the third waits: bounded memory, and neither side idle for long."""
-_INT32: Final = np.iinfo(np.int32)
 
 
 class CloudWriter:
@@ -64,28 +57,21 @@ class CloudWriter:
         gps: bool = True,
         about: str = "Velodyne HDL-32E",
     ) -> None:
-        self._path, self._gps = path, gps
-        self._dimensions = in_order(columns)
-        header = _header(self._dimensions, crs, offset_m, gps, about)
+        self._packer = Packer(path, columns, crs=crs, offset_m=offset_m, gps=gps, about=about)
         try:
             self._las = laspy.open(
-                path, mode="w", header=header, laz_backend=laspy.LazBackend.LazrsParallel, do_compress=True
+                path, mode="w", header=self._packer.header, laz_backend=laspy.LazBackend.LazrsParallel, do_compress=True
             )
         except OSError as error:
             raise SourceError(f"{path}: cannot be written ({error.strerror})") from None
-        self._offset_m = np.asarray(offset_m, np.float64)
-        self._limits = np.array([[_INT32.max] * 3, [_INT32.min] * 3], np.int64)
-        self._by_return = np.zeros(16, np.int64)
-        dtype = header.point_format.dtype()
-        self._filling, self._used = np.zeros(BUFFER_POINTS, dtype), 0
+        self._filling, self._used = np.zeros(BUFFER_POINTS, self._packer.dtype), 0
         self._full: queue.SimpleQueue[npt.NDArray[np.void] | None] = queue.SimpleQueue()
         self._free: queue.SimpleQueue[npt.NDArray[np.void]] = queue.SimpleQueue()
         for _ in range(_BUFFERS - 1):
-            self._free.put(np.zeros(BUFFER_POINTS, dtype))
+            self._free.put(np.zeros(BUFFER_POINTS, self._packer.dtype))
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._compress, name="laz", daemon=True)
         self._thread.start()
-        self.points = 0
 
     def __enter__(self) -> Self:
         return self
@@ -97,12 +83,17 @@ class CloudWriter:
         self._full.put(None)
         self._thread.join()
         if self._error is None:
-            self._state_totals(self._las.header)
+            self._packer.state_totals(self._las.header)
             self._las.close()
         else:
             self._las.dest.close()
         if self._error is not None and error is None:
             raise self._error
+
+    @property
+    def points(self) -> int:
+        """How many were written."""
+        return self._packer.points
 
     def write(self, points: Points) -> None:
         """Append points.
@@ -112,48 +103,18 @@ class CloudWriter:
         SourceError
             A coordinate or an attribute lies beyond what its stored number can hold.
         """
-        assert points.columns.keys() == {entry.name for entry in self._dimensions}, list(points.columns)
         start = 0
         while start < len(points):
             if self._error is not None:
                 raise self._error
             count = min(len(points) - start, BUFFER_POINTS - self._used)
-            self._pack(points.masked(slice(start, start + count)), self._filling[self._used : self._used + count])
-            start, self._used, self.points = start + count, self._used + count, self.points + count
+            self._packer.pack(
+                points.masked(slice(start, start + count)), self._filling[self._used : self._used + count]
+            )
+            start, self._used = start + count, self._used + count
             if self._used == BUFFER_POINTS:
                 self._full.put(self._filling)
                 self._filling, self._used = self._free.get(), 0
-
-    def _pack(self, points: Points, out: npt.NDArray[np.void]) -> None:
-        """Fill a piece of a buffer."""
-        time_s = gps_time_s(points.time_ns) if self._gps else points.time_ns * 1e-9
-        number, returns = (points.columns.get(name) for name in BIT_FIELDS)
-        one = np.ones(1, np.uint8)  # LAS counts from 1: an echo of which nothing is known is the only one
-        place = tuple(out[name] for name in ("X", "Y", "Z", "gps_time", "bit_fields"))
-        _pack_place(
-            points.xyz_m, time_s, one if number is None else number, one if returns is None else returns,
-            self._offset_m, place, self._limits, self._by_return,
-        )  # fmt: skip
-        if self._limits[0].min() < _INT32.min or self._limits[1].max() > _INT32.max:
-            raise SourceError(
-                f"{self._path}: a point lies more than {_INT32.max * SCALE_M / 1e3:.0f} km from the origin of the file"
-            )
-        for entry in self._dimensions:
-            if entry.field not in BIT_FIELDS:
-                self._pack_column(entry, points.columns[entry.name], out[entry.field or entry.name])
-
-    def _pack_column(self, entry: Dimension, values: npt.NDArray[Any], out: npt.NDArray[Any]) -> None:
-        """Fill one attribute of a piece of a buffer."""
-        if entry.scale is None:
-            out[:] = values
-            return
-        low, high = entry.steps()
-        if _pack_scaled(values, 1.0 / entry.scale, low, high, entry.no_data or 0, entry.no_data is not None, out):
-            raise SourceError(
-                f"{self._path}: {entry.name} of {np.nanmin(values):g} to {np.nanmax(values):g} {entry.unit} found, expected "
-                f"{low * entry.scale:g} to {high * entry.scale:g}, which is what its {entry.stored.itemsize} bytes can hold"
-                + ("" if entry.no_data is not None else ", and no value that is not a number")
-            )
 
     def _compress(self) -> None:
         """Compress what is full, in order; the thread's work."""
@@ -165,86 +126,3 @@ class CloudWriter:
             except BaseException as error:  # handed to the producer, whatever it is
                 self._error = error
             self._free.put(points)  # also after an error, so that the producer never waits for a dead thread
-
-    def _state_totals(self, header: laspy.LasHeader) -> None:
-        """Write extent and counts of all points into the header."""
-        header.point_count = self.points
-        header.number_of_points_by_return[:] = self._by_return[1:]
-        header.mins, header.maxs = self._limits * SCALE_M + self._offset_m
-        for records in header.vlrs.get("ExtraBytesVlr"):
-            for each in records.extra_bytes_structs:
-                # laspy counts the extent of extra bytes in the write_points() passed by above: better none than a wrong one
-                each.options &= ~(each.MIN_BIT_MASK | each.MAX_BIT_MASK)
-
-
-def round_origin_m(place_m: npt.NDArray[np.float64]) -> tuple[float, float, float]:
-    """Origin for the stored whole numbers of a cloud around a place, shape (3,): whole hundreds of metres, and height 0."""
-    return float(np.floor(place_m[0] / 100) * 100), float(np.floor(place_m[1] / 100) * 100), 0.0
-
-
-def _header(
-    dimensions: Sequence[Dimension], crs: pyproj.CRS | None, offset_m: Sequence[float], gps: bool, about: str
-) -> laspy.LasHeader:
-    """The header of a file with some attributes; totals come at its end."""
-    fields = {entry.field for entry in dimensions}
-    header = laspy.LasHeader(version="1.4", point_format=8 if "nir" in fields else 7 if "red" in fields else 6)
-    header.add_extra_dims([_extra(entry) for entry in dimensions if not entry.field])
-    header.scales, header.offsets = np.full(3, SCALE_M), np.asarray(offset_m, np.float64)
-    header.generating_software, header.system_identifier = f"swath {__version__}"[:31], about[:31]
-    header.creation_date = datetime.now(UTC).date()
-    header.global_encoding.gps_time_type = (
-        laspy.header.GpsTimeType.STANDARD if gps else laspy.header.GpsTimeType.WEEK_TIME
-    )
-    header.global_encoding.wkt = True
-    if crs is not None:
-        header.vlrs.append(WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
-    return header
-
-
-def _extra(entry: Dimension) -> laspy.ExtraBytesParams:
-    scaled = entry.scale is not None
-    return laspy.ExtraBytesParams(
-        entry.name,
-        entry.stored,
-        entry.description,
-        offsets=np.array([0.0]) if scaled else None,
-        scales=np.array([entry.scale]) if scaled else None,
-        no_data=None if entry.no_data is None else np.array([entry.no_data]),
-    )
-
-
-@njit(cache=True, nogil=True)
-def _pack_place(
-    xyz_m: Any, time_s: Any, number: Any, returns: Any, offset_m: Any, out: Any, limits: Any, by_return: Any
-) -> None:
-    """Fill place, time and returns; widen the limits of the stored coordinates, shape (2, 3), and count the returns, shape (16,).
-
-    Return numbers of shape (1,) hold for all points.
-    """
-    out_x, out_y, out_z, out_time, out_returns = out
-    each_number, each_count = int(len(number) > 1), int(len(returns) > 1)
-    for i in range(len(time_s)):
-        for axis, stored in ((0, out_x), (1, out_y), (2, out_z)):
-            value = np.int64(np.rint((xyz_m[i, axis] - offset_m[axis]) * (1.0 / SCALE_M)))
-            stored[i] = value
-            limits[0, axis] = min(limits[0, axis], value)
-            limits[1, axis] = max(limits[1, axis], value)
-        out_time[i] = time_s[i]
-        rank, count = min(number[i * each_number], 15), min(returns[i * each_count], 15)
-        out_returns[i] = rank | count << 4
-        by_return[rank] += 1
-
-
-@njit(cache=True, nogil=True)
-def _pack_scaled(values: Any, per_unit: float, low: int, high: int, no_data: int, has_no_data: bool, out: Any) -> int:
-    """Fill one attribute with whole steps; gives how many lie beyond what it can hold."""
-    beyond = 0
-    for i in range(len(values)):
-        steps = np.rint(values[i] * per_unit)
-        if low <= steps <= high:
-            out[i] = np.int64(steps)
-        elif has_no_data and np.isnan(steps):
-            out[i] = no_data
-        else:
-            beyond += 1
-    return beyond

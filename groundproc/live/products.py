@@ -9,8 +9,9 @@ import numpy as np
 from flightlog import frames
 from flightlog.errors import SourceError
 from groundproc import geodesy
+from groundproc.cloud.packer import round_origin_m
 from groundproc.cloud.points import Points
-from groundproc.cloud.writer import CloudWriter, round_origin_m
+from groundproc.cloud.writer import CloudWriter
 from groundproc.files import written_aside
 from groundproc.flight.positions.posetable import COLUMNS
 from groundproc.geodesy import LocalFrame

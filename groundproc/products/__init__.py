@@ -39,6 +39,7 @@ REGISTRY: Final[dict[str, Entry]] = {
     "pictures": Entry(
         "groundproc.products.pictures", "Pictures", "cloud_height.png, cloud_intensity.png: from above and from the south"
     ),
+    "cloud.copc.laz": Entry("groundproc.products.cloud_copc", "CloudCopc", "the same points as an octree, for viewers"),
     "dsm.tif": Entry("groundproc.products.dsm", "Dsm", "surface model: the highest point of each cell, 0.25 m"),
     "intensity.tif": Entry("groundproc.products.intensity", "Intensity", "mean intensity by cell"),
     "density.tif": Entry("groundproc.products.density", "Density", "points per square metre by cell"),

@@ -10,8 +10,8 @@ import pyproj
 
 from flightlog import __version__
 from flightlog.errors import SourceError, SwathError
+from groundproc.cloud.packer import round_origin_m
 from groundproc.cloud.points import Points
-from groundproc.cloud.writer import round_origin_m
 from groundproc.files import written_aside
 from groundproc.geodesy import Projection, with_sea_level
 from groundproc.products import Chosen

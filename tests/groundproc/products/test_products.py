@@ -165,7 +165,7 @@ def test_a_wish_that_cannot_be_met_is_refused_by_name(wanted: list[Any], said: s
 @pytest.mark.usefixtures("toy")
 def test_without_a_wish_all_defaults_are_made_in_the_order_of_the_registry() -> None:
     assert [each.name for each in chosen(None)] == [
-        "cloud.laz", "pictures", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif",
+        "cloud.laz", "pictures", "cloud.copc.laz", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif",
         "adjustment.png", "lasers.png", "trims.csv", "trims.png",
     ]  # fmt: skip
     assert [each.name for each in chosen(["pictures", "cloud.laz"])] == ["cloud.laz", "pictures"]

@@ -1,0 +1,90 @@
+"""Records that wait on the disk until all are known, sorted by the square of ground that they lie in."""
+
+import tempfile
+import weakref
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import zstandard
+
+from groundproc.numerics.voxelhash import sorted_by
+
+Records = npt.NDArray[np.void]
+Place = tuple[int, int]
+
+_WAITING_BYTES: Final = 96 << 20
+"""In memory before it is written: many squares are written at once, so each gets pieces that are worth compressing."""
+_SMALL: Final = 1 << 12
+"""Records of one square that are written before the others have to be."""
+
+
+class Spool:
+    """A temporary file of records by square.
+
+    Parameters
+    ----------
+    dtype : numpy.dtype
+        Of the records.
+    folder : Path
+        For the file; it has no name, and is gone when this is.
+    """
+
+    def __init__(self, dtype: np.dtype[Any], folder: Path) -> None:
+        self._dtype = dtype
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open as long as this lives)
+        weakref.finalize(self, self._file.close)
+        self._pack = zstandard.ZstdCompressor(level=1)
+        self._unpack = zstandard.ZstdDecompressor()
+        self._waiting: dict[Place, list[Records]] = {}
+        self._bytes = 0
+        self._pieces: dict[Place, list[tuple[int, int]]] = {}
+        self.counts: dict[Place, int] = {}
+        """Records of each square."""
+
+    def add(self, place: Place, records: Records) -> None:
+        """Take records of a square; the array is kept, and may not be changed."""
+        if len(records):
+            self._waiting.setdefault(place, []).append(records)
+            self.counts[place] = self.counts.get(place, 0) + len(records)
+            self._bytes += records.nbytes
+            if self._bytes > _WAITING_BYTES:
+                self._write()
+
+    def add_sorted(self, records: Records, number: npt.NDArray[np.int32], places: list[Place]) -> None:
+        """Take records of many squares: number of the square of each, shape (n,), and the squares."""
+        order, first = sorted_by(number, len(places))
+        records = records[order]
+        for each, place in enumerate(places):
+            self.add(place, records[first[each] : first[each + 1]])
+
+    def take(self, place: Place) -> Records:
+        """All records of a square, in the order in which they came; they are here no longer."""
+        parts = []
+        for begin, size in self._pieces.pop(place, ()):
+            self._file.seek(begin)
+            raw = np.frombuffer(self._unpack.decompress(self._file.read(size)), np.uint8)
+            # bytes of the same rank lie together, as they are compressed best
+            parts.append(np.ascontiguousarray(raw.reshape(self._dtype.itemsize, -1).T).view(self._dtype)[:, 0])
+        waiting = self._waiting.pop(place, [])
+        self._bytes -= sum(each.nbytes for each in waiting)
+        self.counts.pop(place, None)
+        found = parts + waiting
+        return np.concatenate(found) if found else np.empty(0, self._dtype)
+
+    def _write(self) -> None:
+        """Write what waits; squares with few records wait on, unless that is all there is."""
+        self._file.seek(0, 2)
+        at = self._file.tell()
+        many = {place for place, parts in self._waiting.items() if sum(map(len, parts)) >= _SMALL}
+        for place in many or list(self._waiting):
+            records = np.concatenate(self._waiting.pop(place))
+            self._bytes -= records.nbytes
+            raw = records.view(np.uint8).reshape(len(records), self._dtype.itemsize)
+            packed = self._pack.compress(np.ascontiguousarray(raw.T).data)
+            self._file.write(packed)
+            self._pieces.setdefault(place, []).append((at, len(packed)))
+            at += len(packed)
+        if many and self._bytes > _WAITING_BYTES // 2:  # very many squares with few records each
+            self._write()

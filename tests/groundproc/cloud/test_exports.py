@@ -1,0 +1,134 @@
+"""`swath export`: each format read again by somebody else's reader."""
+
+from pathlib import Path
+
+import copclib
+import laspy
+import numpy as np
+import pye57
+import pyproj
+import pytest
+
+from groundproc.cli import main
+
+
+def cloud(path: Path, point_format: int = 6, count: int = 60_000, epsg: int | None = 32633) -> laspy.LasData:
+    """A cloud of another program's, with an attribute that we do not know."""
+    header = laspy.LasHeader(version="1.2" if point_format < 4 else "1.4", point_format=point_format)
+    header.scales, header.offsets = [0.001] * 3, [533_000.0, 6_472_000.0, 0.0]
+    if epsg is not None:
+        header.add_crs(pyproj.CRS.from_epsg(epsg))
+    header.add_extra_dim(laspy.ExtraBytesParams("theirs", "f8"))
+    las = laspy.LasData(header)
+    rng = np.random.default_rng(3)
+    las.x, las.y = 533_400.0 + rng.uniform(0, 80, count), 6_472_100.0 + rng.uniform(0, 50, count)
+    las.z, las.intensity = rng.normal(50, 2, count), rng.integers(0, 255, count)
+    las.theirs, las.classification = rng.normal(0, 1, count), rng.integers(0, 19, count)
+    las.return_number = las.number_of_returns = np.ones(count, np.uint8)
+    if "gps_time" in header.point_format.dimension_names:
+        las.gps_time = np.arange(count) * 1e-5
+    if "red" in header.point_format.dimension_names:
+        las.red = las.green = las.blue = rng.integers(0, 65535, count)
+    las.write(path)
+    return laspy.read(path)
+
+
+def in_one_order(las: laspy.LasData, names: list[str]) -> np.ndarray:
+    rows = np.rec.fromarrays([np.asarray(las[name]) for name in names], names=names)
+    return np.sort(rows, order=names)
+
+
+@pytest.mark.parametrize("point_format", [0, 1, 3, 6, 7])
+def test_a_copc_holds_every_point_and_field_as_two_other_readers_see_it(point_format: int, tmp_path: Path) -> None:
+    source = cloud(tmp_path / "c.laz", point_format)
+    assert main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.copc.laz")]) == 0
+    with laspy.CopcReader.open(tmp_path / "c.copc.laz") as reader:
+        found = reader.query()
+        coarse = reader.query(level=0)
+        assert reader.header.parse_crs().to_epsg() == 32633
+        np.testing.assert_allclose(reader.header.mins, source.header.mins)
+        np.testing.assert_allclose(reader.header.maxs, source.header.maxs)
+    names = ["X", "Y", "Z", "theirs", "intensity", "classification", "return_number"]
+    names += [name for name in ("gps_time", "red") if name in source.point_format.dimension_names]
+    np.testing.assert_array_equal(in_one_order(found, names), in_one_order(source, names))
+    assert 1_000 < len(coarse) < len(source.points)
+    other = copclib.FileReader(str(tmp_path / "c.copc.laz"))
+    assert sum(node.point_count for node in other.GetAllNodes()) == len(source.points)
+    assert other.ValidateSpatialBounds(False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c.copc.laz", "c.laz"]
+
+
+def test_a_copc_is_a_laz_file_for_who_knows_no_copc(tmp_path: Path) -> None:
+    source = cloud(tmp_path / "c.laz")
+    main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.copc.laz")])
+    names = ["X", "Y", "Z", "gps_time", "theirs"]
+    np.testing.assert_array_equal(in_one_order(laspy.read(tmp_path / "c.copc.laz"), names), in_one_order(source, names))
+
+
+@pytest.mark.parametrize("ending", ["laz", "las"])
+def test_las_and_laz_keep_order_and_every_field(ending: str, tmp_path: Path) -> None:
+    source = cloud(tmp_path / "c.laz")
+    main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / f"d.{ending}")])
+    made = laspy.read(tmp_path / f"d.{ending}")
+    assert made.header.are_points_compressed == (ending == "laz")
+    np.testing.assert_array_equal(made.points.array, source.points.array)
+
+
+def test_ply_holds_coordinates_in_double_precision_and_the_attributes(tmp_path: Path) -> None:
+    source = cloud(tmp_path / "c.laz", 7, 1000)
+    main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.ply")])
+    head, _, body = (tmp_path / "c.ply").read_bytes().partition(b"end_header\n")
+    lines = head.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert "element vertex 1000" in lines
+    kinds = {"double": "<f8", "float": "<f4", "ushort": "<u2", "uchar": "u1"}
+    fields = [line.split()[1:] for line in lines if line.startswith("property")]
+    rows = np.frombuffer(body, [(name, kinds[kind]) for kind, name in fields])
+    np.testing.assert_array_equal(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz)
+    np.testing.assert_array_equal(rows["intensity"], source.intensity)
+    np.testing.assert_array_equal(rows["red"], np.asarray(source.red) >> 8)
+
+
+def test_csv_has_a_header_and_digits_enough(tmp_path: Path) -> None:
+    source = cloud(tmp_path / "c.laz", 6, 500)
+    main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.csv")])
+    rows = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz, atol=1e-6)
+    np.testing.assert_array_equal(rows["classification"], source.classification)
+    np.testing.assert_allclose(rows["gps_time"], source.gps_time, atol=1e-9)
+
+
+def test_e57_is_read_by_its_own_library(tmp_path: Path) -> None:
+    source = cloud(tmp_path / "c.laz", 7, 3000)
+    main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.e57")])
+    with pye57.E57(str(tmp_path / "c.e57")) as file:
+        scan = file.read_scan(0, intensity=True, colors=True, ignore_missing_fields=True)
+        assert "UTM zone 33N" in file.root["coordinateMetadata"].value()
+    found = np.stack([scan["cartesianX"], scan["cartesianY"], scan["cartesianZ"]], axis=1)
+    np.testing.assert_allclose(found, source.xyz, atol=1e-6)
+    np.testing.assert_array_equal(scan["intensity"], source.intensity)
+    np.testing.assert_array_equal(scan["colorRed"], np.asarray(source.red) >> 8)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["c.laz", "-o", "c.xyz"], "ends in .copc.laz"),
+        (["none.laz", "-o", "c.ply"], "none.laz"),
+        (["text.laz", "-o", "c.ply"], "text.laz"),
+        (["c.laz", "-o", "text.laz"], "--force overwrites"),
+        (["c.laz", "-o", "nowhere/c.ply"], "nowhere"),
+    ],
+)
+def test_what_cannot_be_written_is_one_sentence(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cloud(tmp_path / "c.laz", count=10)
+    (tmp_path / "text.laz").write_text("no cloud")
+    before = sorted(tmp_path.iterdir())
+    assert main(["export", *words]) in (1, 2)
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
