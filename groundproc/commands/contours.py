@@ -1,0 +1,41 @@
+"""`swath contours`: lines of equal height of a terrain or surface model, as GeoPackage, GeoJSON or DXF."""
+
+import argparse
+from pathlib import Path
+
+HELP = "draw contours of a raster of heights, to GeoPackage, GeoJSON or DXF"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument("raster", type=Path, metavar="DTM", help="a GeoTIFF of heights")
+    parser.add_argument("--interval", type=float, default=0.5, metavar="M", help="between the lines [m]; default: 0.5")
+    parser.add_argument(
+        "--shortest", type=float, default=2.0, metavar="M", help="shorter lines are left out [m]; default: 2"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="a name that ends in .gpkg, .geojson or .dxf"
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite the output")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw them."""
+    from flightlog.errors import CoverageError, SourceError, UsageError
+    from groundproc.files import written_aside
+    from groundproc.raster import geotiff
+    from groundproc.vectors import contours, files
+
+    output: Path = arguments.output
+    if output.suffix.lower() not in files.ENDINGS:
+        raise UsageError(f"-o {output}: expected a name that ends in {', '.join(files.ENDINGS)}")
+    if output.exists() and not arguments.force:
+        raise SourceError(f"{output}: is there already; --force overwrites it")
+    with geotiff.opened(arguments.raster) as raster:
+        lines = list(contours.contours(raster, arguments.interval, arguments.shortest))
+        if not lines:
+            raise CoverageError(f"{arguments.raster}: no contour at whole multiples of {arguments.interval:g} m")
+        with written_aside(output) as aside:
+            files.write_contours(aside, output.suffix.lower(), lines, raster.crs)
+    print(f"{len(lines)} contours of {lines[0].height_m:g} to {lines[-1].height_m:g} m in {output}")
+    return 0

@@ -1,0 +1,70 @@
+"""`swath volume`: what heaps and pits hold."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+HELP = "measure volumes of a cloud within polygons: cut, fill, net, each with its sigma"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
+    parser.add_argument("polygons", type=Path, metavar="POLYGONS", help="GeoPackage or GeoJSON with a CRS")
+    parser.add_argument(
+        "--base", default="toe", metavar="toe|plane|FILE.tif",
+        help="what volumes are counted from: triangles through the heights along the polygon's edge, the plane through them, or a "
+        "raster of heights; default: toe",
+    )  # fmt: skip
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
+    parser.add_argument("--force", action="store_true", help="overwrite the file")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, and print a table."""
+    import json
+
+    from tqdm import tqdm
+
+    from flightlog.errors import SourceError, UsageError
+    from groundproc.analysis import volumes
+    from groundproc.files import written_aside
+
+    base = arguments.base
+    if base not in volumes.BASES and not base.lower().endswith((".tif", ".tiff")):
+        raise UsageError(
+            f"--base {base}: expected {', '.join(volumes.BASES)} or the name of a raster that ends in .tif"
+        )
+    if arguments.json is not None and arguments.json.exists() and not arguments.force:
+        raise SourceError(f"{arguments.json}: is there already; --force overwrites it")
+    with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
+        found, cloud = volumes.measure(arguments.cloud, arguments.polygons, base, bar.update)
+    rows: list[dict[str, Any]] = []
+    unmeasured = []
+    for each in found:
+        one = each.volume
+        if one is None:
+            unmeasured.append({"id": each.id, "reason": each.reason})
+            print(f"swath: warning: polygon {each.id} is not measured: {each.reason}", file=sys.stderr)
+            continue
+        rows.append(
+            {
+                "id": each.id, "cut_m3": one.cut_m3, "fill_m3": one.fill_m3, "net_m3": one.net_m3, "sigma_m3": one.sigma_m3,
+                "area_m2": one.area_m2, "empty_m2": one.empty_m2,
+            }
+        )  # fmt: skip
+    if arguments.json is not None:
+        told = {
+            "base": base,
+            "crs": None if cloud.crs is None else cloud.crs.name,
+            "polygons": rows,
+            "unmeasured": unmeasured,
+        }
+        with written_aside(arguments.json) as aside:
+            aside.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    print(f"{'polygon':<14}{'cut [m3]':>12}{'fill [m3]':>12}{'net [m3]':>12}{'sigma [m3]':>12}{'area [m2]':>12}")
+    for row in rows:
+        values = (row[name] for name in ("cut_m3", "fill_m3", "net_m3", "sigma_m3", "area_m2"))
+        print(f"{row['id'][:14]:<14}" + "".join(f"{value:>12.2f}" for value in values))
+    return 0

@@ -1,0 +1,146 @@
+"""`swath volume`: heaps and pits whose volume geometry gives."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pyogrio
+import pyproj
+import pytest
+import rasterio
+import shapely
+from rasterio.transform import from_origin
+
+from groundproc.cli import main
+
+ORIGIN = np.array([533_000.0, 6_472_000.0])
+
+
+def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A slope of 5 % and 2 %."""
+    return 50.0 + 0.05 * x - 0.02 * y
+
+
+def scene(path: Path, seed: int = 1, noise_m: float = 0.02, per_m2: float = 60.0) -> Path:
+    """A cone of radius 8 m and height 4 m at (20, 20), and a square pit of 6 m, 1.5 m deep, at (45, 20), on a slope."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 60, (2, int(60 * 40 * per_m2)))
+    y *= 40 / 60
+    z = ground(x, y) + np.maximum(4.0 * (1 - np.hypot(x - 20, y - 20) / 8.0), 0.0)
+    z -= 1.5 * ((np.abs(x - 45) < 3) & (np.abs(y - 20) < 3))
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, [*ORIGIN, 0.0]
+    header.add_crs(pyproj.CRS.from_epsg(32633))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = x + ORIGIN[0], y + ORIGIN[1], z + rng.normal(0, noise_m, len(z))
+    las.write(path)
+    return path
+
+
+def polygons(path: Path, shapes: dict[str, Any], epsg: int = 32633) -> Path:
+    """Polygons about the origin of the scene, in a CRS."""
+    moved = [shapely.transform(each, lambda xy: xy + ORIGIN) for each in shapes.values()]
+    if epsg != 32633:
+        to = pyproj.Transformer.from_crs(32633, epsg, always_xy=True)
+        moved = [shapely.transform(each, lambda xy: np.stack(to.transform(*xy.T), axis=1)) for each in moved]
+    pyogrio.raw.write(
+        path, shapely.to_wkb(np.array(moved, object)), [np.array(list(shapes), object)], ["id"],
+        geometry_type="Polygon", crs=f"EPSG:{epsg}", driver="GPKG" if path.suffix == ".gpkg" else "GeoJSON",
+    )  # fmt: skip
+    return path
+
+
+HEAP = shapely.Point(20, 20).buffer(10.0)
+PIT = shapely.box(40, 15, 50, 25)
+CONE_M3 = math.pi * 8.0**2 * 4.0 / 3.0
+PIT_M3 = 6.0 * 6.0 * 1.5
+
+
+def measured(tmp_path: Path, *words: str | Path) -> dict[str, dict[str, Any]]:
+    assert main(["volume", *map(str, words), "--json", str(tmp_path / "v.json"), "--force"]) == 0
+    return {each["id"]: each for each in json.loads((tmp_path / "v.json").read_text())["polygons"]}
+
+
+@pytest.mark.parametrize("base", ["toe", "plane"])
+@pytest.mark.parametrize(("name", "epsg"), [("p.gpkg", 32633), ("p.geojson", 4326)])
+def test_a_heap_and_a_pit_on_a_slope_hold_what_geometry_says(base: str, name: str, epsg: int, tmp_path: Path) -> None:
+    cloud = scene(tmp_path / "c.laz")
+    found = measured(tmp_path, cloud, polygons(tmp_path / name, {"heap": HEAP, "pit": PIT}, epsg), "--base", base)
+    heap, pit = found["heap"], found["pit"]
+    # noise of 2 cm makes |z| of 7 mm in each cell of six points on bare ground, which cut and fill share, and net does not
+    assert heap["net_m3"] == pytest.approx(CONE_M3, abs=3.0 * heap["sigma_m3"])
+    assert pit["net_m3"] == pytest.approx(-PIT_M3, abs=3.0 * pit["sigma_m3"])
+    assert heap["sigma_m3"] < 0.02 * CONE_M3
+    assert heap["cut_m3"] - heap["fill_m3"] == pytest.approx(heap["net_m3"])
+    assert heap["fill_m3"] < 0.01 * CONE_M3
+    assert pit["cut_m3"] < 0.02 * PIT_M3
+    assert heap["area_m2"] == pytest.approx(HEAP.area, rel=1e-3)
+
+
+def test_errors_lie_within_their_sigma_over_many_seeds(tmp_path: Path) -> None:
+    shapes = polygons(tmp_path / "p.gpkg", {"heap": HEAP, "pit": PIT})
+    errors = []
+    for seed in range(12):
+        found = measured(tmp_path, scene(tmp_path / "c.laz", seed, 0.05, 25.0), shapes)
+        errors.append((found["heap"]["net_m3"] - CONE_M3) / found["heap"]["sigma_m3"])
+        errors.append((found["pit"]["net_m3"] + PIT_M3) / found["pit"]["sigma_m3"])
+    assert np.mean(np.abs(errors) <= 2.0) >= 0.9
+
+
+def test_a_raster_is_a_base_too(tmp_path: Path) -> None:
+    cell = 0.5
+    j, i = np.mgrid[:80, :120]
+    heights = ground((i + 0.5) * cell, 40.0 - (j + 0.5) * cell).astype(np.float32)
+    transform = from_origin(ORIGIN[0], ORIGIN[1] + 40.0, cell, cell)
+    with rasterio.open(
+        tmp_path / "base.tif", "w", driver="GTiff", width=120, height=80, count=1, dtype="float32", crs="EPSG:32633",
+        transform=transform,
+    ) as file:  # fmt: skip
+        file.write(heights, 1)
+    found = measured(
+        tmp_path,
+        scene(tmp_path / "c.laz"),
+        polygons(tmp_path / "p.gpkg", {"heap": HEAP}),
+        "--base",
+        tmp_path / "base.tif",
+    )
+    assert found["heap"]["net_m3"] == pytest.approx(CONE_M3, rel=0.005)
+
+
+def test_a_polygon_beyond_the_cloud_is_named_and_the_others_are_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shapes = polygons(tmp_path / "p.gpkg", {"heap": HEAP, "away": shapely.box(200, 200, 210, 210)})
+    assert list(measured(tmp_path, scene(tmp_path / "c.laz"), shapes)) == ["heap"]
+    assert "polygon away is not measured: no points" in capsys.readouterr().err
+    told = json.loads((tmp_path / "v.json").read_text())
+    assert [each["id"] for each in told["unmeasured"]] == ["away"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["c.laz", "p.gpkg", "--base", "roof"], "--base roof"),
+        (["c.laz", "c.laz"], "ends in .gpkg"),
+        (["c.laz", "none.gpkg"], "none.gpkg"),
+        (["c.laz", "far.gpkg"], "not one polygon"),
+        (["c.laz", "bow.gpkg"], "does not cross itself"),
+        (["c.laz", "p.gpkg", "--base", "none.tif"], "none.tif"),
+    ],
+)
+def test_what_cannot_be_measured_is_one_sentence(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene(Path("c.laz"), per_m2=2.0)
+    polygons(Path("p.gpkg"), {"heap": HEAP})
+    polygons(Path("far.gpkg"), {"far": shapely.box(900, 900, 910, 910)})
+    polygons(Path("bow.gpkg"), {"bow": shapely.Polygon([(10, 10), (20, 20), (20, 10), (10, 20)])})
+    capsys.readouterr()
+    assert main(["volume", *words]) in (1, 2)
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
