@@ -44,6 +44,10 @@ REGISTRY: Final[dict[str, Entry]] = {
     "intensity.tif": Entry("groundproc.products.intensity", "Intensity", "mean intensity by cell"),
     "density.tif": Entry("groundproc.products.density", "Density", "points per square metre by cell"),
     "hillshade.tif": Entry("groundproc.products.hillshade", "Hillshade", "surface model lit from the north-west"),
+    "trajectory.gpkg": Entry("groundproc.products.trajectory_gpkg", "write", "the flown path as lines, for maps"),
+    "trajectory.gpx": Entry(
+        "groundproc.products.trajectory_maps", "write", "the flown path for phones and globes: trajectory.gpx and .kml", by_default=False
+    ),
     "adjustment.png": Entry(
         "groundproc.products.adjustment_plot", "draw", "method adjusted: what it left over, and how well it knows what it estimated"
     ),

@@ -166,7 +166,7 @@ def test_a_wish_that_cannot_be_met_is_refused_by_name(wanted: list[Any], said: s
 def test_without_a_wish_all_defaults_are_made_in_the_order_of_the_registry() -> None:
     assert [each.name for each in chosen(None)] == [
         "cloud.laz", "pictures", "cloud.copc.laz", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif",
-        "adjustment.png", "lasers.png", "trims.csv", "trims.png",
+        "trajectory.gpkg", "adjustment.png", "lasers.png", "trims.csv", "trims.png",
     ]  # fmt: skip
     assert [each.name for each in chosen(["pictures", "cloud.laz"])] == ["cloud.laz", "pictures"]
     assert chosen(["quality.json", "trajectory.csv"]) == []
@@ -187,7 +187,7 @@ def test_the_cloud_states_where_it_is_and_what_its_points_have(context: Context)
 
 def test_pictures_of_methods_that_did_not_run_are_not_drawn(context: Context) -> None:
     draw(chosen(None), context)
-    assert names(context.folder) == []
+    assert names(context.folder) == ["trajectory.gpkg"]
 
 
 def test_the_registry_imports_no_product() -> None:
