@@ -225,6 +225,11 @@ def payload_dtype(number: int) -> np.dtype[np.void]:
     return np.dtype(fields)
 
 
+def message_name(number: int) -> str | None:
+    """Name of the message with an id; None for one outside the dialect."""
+    return _NAMES.get(number)
+
+
 def field_offset(name: str, field: str) -> int | None:
     """Where a field of a message begins in its payload [bytes]; None where the message has no such field."""
     fields = payload_dtype(message_id(name)).fields

@@ -16,8 +16,6 @@ from groundproc.flight.autopilot import Boot
 LARGEST_DRIFT: Final = 300e-6
 """Drift of one crystal against another beyond which a fit has followed the jitter [s/s]."""
 LEAST_DRIFT_SPAN_S: Final = 60.0
-PLAUSIBLE_UTC_NS: Final = (946_684_800 * NS_PER_S, 4_102_444_800 * NS_PER_S)
-"""2000 to 2100: what lies outside is no date but a counter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +139,7 @@ def boot_utc(boot: Boot) -> UtcTie | None:
     if not boot.has("SYSTEM_TIME", 1):
         return None
     unix_ns = boot.tables["SYSTEM_TIME"]["time_unix_usec"].astype(np.int64) * NS_PER_US
-    known = (unix_ns > PLAUSIBLE_UTC_NS[0]) & (unix_ns < PLAUSIBLE_UTC_NS[1])
+    known = (unix_ns >= clock.PLAUSIBLE_UTC_NS[0]) & (unix_ns < clock.PLAUSIBLE_UTC_NS[1])
     if not known.any():
         return None
     offset_ns = unix_ns[known] - boot.stamps_ns["SYSTEM_TIME"][known]

@@ -1,0 +1,95 @@
+"""The clocks of the devices whose messages a recording holds, read from the messages' own bytes."""
+
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from flightlog import clock, hdl32e, mavlink, nmea, records
+from flightlog.constants import HOUR_NS, NS_PER_MS, NS_PER_S, NS_PER_US
+from groundproc.flight.importers.joining import Event
+
+
+def _place(dtype: np.dtype[Any], name: str) -> slice:
+    """Where a field lies in a packet."""
+    assert dtype.fields is not None
+    kind, offset = dtype.fields[name][:2]
+    return slice(int(offset), int(offset) + int(kind.itemsize))
+
+
+_DATA_STAMP: Final = _place(hdl32e.DATA_DTYPE, "stamp_us")
+_POSITION_STAMP: Final = _place(hdl32e.POSITION_DTYPE, "stamp_us")
+_SENTENCE: Final = _place(hdl32e.POSITION_DTYPE, "nmea")
+_SYSTEM_TIME: Final = mavlink.message_id("SYSTEM_TIME")
+_BOOT_WRAP_NS: Final = (1 << 32) * NS_PER_MS
+
+
+class Reading(NamedTuple):
+    """What a message says of the clock of the device that sent it."""
+
+    device: tuple[str, bytes]
+    """Whose clock."""
+    time_ns: int | None
+    """Its time when it sent the message, modulo `wrap_ns`; None where the message does not say."""
+    wrap_ns: int
+    kind: int
+    """Messages of one kind are sent in the order of the device's times."""
+    sequence: int | None
+    """Number of the message modulo 256; None where the kind has none."""
+    slack_ns: int
+    """Messages may come so much later than the fastest of them, and no clock was set."""
+
+
+def reading(event: Event) -> Reading | None:
+    """The clock that an event's bytes tell of; None for those of no device known."""
+    if event.topic == records.LIDAR.topic:
+        return _lidar(event, _DATA_STAMP, 0) if len(event.data) == hdl32e.DATA_BYTES else None
+    if event.topic == records.POSITION.topic:
+        return _lidar(event, _POSITION_STAMP, 1) if len(event.data) == hdl32e.POSITION_BYTES else None
+    return _autopilot(event.data) if event.topic.startswith(records.MAVLINK.topic) else None
+
+
+def _lidar(event: Event, place: slice, kind: int) -> Reading:
+    stamp_us = int.from_bytes(event.data[place], "little")
+    return Reading(("lidar", event.sender), stamp_us * NS_PER_US % HOUR_NS, HOUR_NS, kind, None, NS_PER_S // 2)
+
+
+def _autopilot(data: bytes) -> Reading | None:
+    found = _frame(data)
+    if found is None:
+        return None
+    sender, sequence, number, payload = found
+    offset = _boot_place(number)
+    # version 2 cuts trailing zeros
+    stamp_ms = None if offset is None else int.from_bytes(payload[offset : offset + 4], "little")
+    time_ns = None if stamp_ms is None else stamp_ms * NS_PER_MS
+    return Reading(("autopilot", sender), time_ns, _BOOT_WRAP_NS, number, sequence, 3 * NS_PER_S)
+
+
+@cache
+def _boot_place(number: int) -> int | None:
+    """Where a message has its boot time; None where it has none or is of no kind known."""
+    name = mavlink.message_name(number)
+    return None if name is None else mavlink.field_offset(name, "time_boot_ms")
+
+
+def _frame(data: bytes) -> tuple[bytes, int, int, bytes] | None:
+    """Sender, sequence, message id and payload of the first frame of some bytes; its checksum is looked at by others."""
+    if len(data) >= 8 and data[0] == 0xFE:
+        return data[3:5], data[2], data[5], data[6 : 6 + data[1]]
+    if len(data) >= 12 and data[0] == 0xFD:
+        return data[5:7], data[4], int.from_bytes(data[7:10], "little"), data[10 : 10 + data[1]]
+    return None
+
+
+def stated_utc_ns(event: Event) -> int | None:
+    """UTC that an event states: SYSTEM_TIME of an autopilot, or the sentence of a valid fix in a position packet; None for others."""
+    utc_ns = None
+    if event.topic == records.POSITION.topic and len(event.data) == hdl32e.POSITION_BYTES:
+        fix = nmea.parse_rmc(event.data[_SENTENCE])
+        utc_ns = fix.utc_ns if fix is not None and fix.valid else None
+    elif event.topic.startswith(records.MAVLINK.topic):
+        found = _frame(event.data)
+        if found is not None and found[2] == _SYSTEM_TIME:
+            utc_ns = int.from_bytes(found[3][:8], "little") * NS_PER_US
+    return utc_ns if utc_ns is not None and clock.is_plausible(utc_ns) else None
