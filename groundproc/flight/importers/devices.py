@@ -36,6 +36,8 @@ class Reading(NamedTuple):
     """Messages of one kind are sent in the order of the device's times."""
     sequence: int | None
     """Number of the message modulo 256; None where the kind has none."""
+    early_ns: int
+    """Nothing is received before it was sent: a stamp that is earlier by more, by the clock of the device, is wrong."""
     slack_ns: int
     """Messages may come so much later than the fastest of them, and no clock was set."""
 
@@ -51,19 +53,23 @@ def reading(event: Event) -> Reading | None:
 
 def _lidar(event: Event, place: slice, kind: int) -> Reading:
     stamp_us = int.from_bytes(event.data[place], "little")
-    return Reading(("lidar", event.sender), stamp_us * NS_PER_US % HOUR_NS, HOUR_NS, kind, None, NS_PER_S // 2)
+    return Reading(
+        ("lidar", event.sender), stamp_us * NS_PER_US % HOUR_NS, HOUR_NS, kind, None, 100 * NS_PER_MS, 150 * NS_PER_MS
+    )
 
 
 def _autopilot(data: bytes) -> Reading | None:
-    found = _frame(data)
-    if found is None:
+    frame = mavlink.frame_of(data)
+    if frame is None or not frame.known:
         return None
-    sender, sequence, number, payload = found
-    offset = _boot_place(number)
+    place = _boot_place(frame.message_id)
     # version 2 cuts trailing zeros
-    stamp_ms = None if offset is None else int.from_bytes(payload[offset : offset + 4], "little")
+    stamp_ms = None if place is None else int.from_bytes(frame.payload[place : place + 4], "little")
     time_ns = None if stamp_ms is None else stamp_ms * NS_PER_MS
-    return Reading(("autopilot", sender), time_ns, _BOOT_WRAP_NS, number, sequence, 3 * NS_PER_S)
+    device = ("autopilot", bytes((frame.system, frame.component)))
+    # its messages have the time of what they tell, which differs from kind to kind
+    early_ns, slack_ns = NS_PER_S // 2, 3 * NS_PER_S
+    return Reading(device, time_ns, _BOOT_WRAP_NS, frame.message_id, frame.sequence, early_ns, slack_ns)
 
 
 @cache
@@ -73,15 +79,6 @@ def _boot_place(number: int) -> int | None:
     return None if name is None else mavlink.field_offset(name, "time_boot_ms")
 
 
-def _frame(data: bytes) -> tuple[bytes, int, int, bytes] | None:
-    """Sender, sequence, message id and payload of the first frame of some bytes; its checksum is looked at by others."""
-    if len(data) >= 8 and data[0] == 0xFE:
-        return data[3:5], data[2], data[5], data[6 : 6 + data[1]]
-    if len(data) >= 12 and data[0] == 0xFD:
-        return data[5:7], data[4], int.from_bytes(data[7:10], "little"), data[10 : 10 + data[1]]
-    return None
-
-
 def stated_utc_ns(event: Event) -> int | None:
     """UTC that an event states: SYSTEM_TIME of an autopilot, or the sentence of a valid fix in a position packet; None for others."""
     utc_ns = None
@@ -89,7 +86,7 @@ def stated_utc_ns(event: Event) -> int | None:
         fix = nmea.parse_rmc(event.data[_SENTENCE])
         utc_ns = fix.utc_ns if fix is not None and fix.valid else None
     elif event.topic.startswith(records.MAVLINK.topic):
-        found = _frame(event.data)
-        if found is not None and found[2] == _SYSTEM_TIME:
-            utc_ns = int.from_bytes(found[3][:8], "little") * NS_PER_US
+        frame = mavlink.frame_of(event.data)
+        if frame is not None and frame.message_id == _SYSTEM_TIME:
+            utc_ns = int.from_bytes(frame.payload[:8], "little") * NS_PER_US
     return utc_ns if utc_ns is not None and clock.is_plausible(utc_ns) else None

@@ -51,9 +51,11 @@ class Order:
         """Take the next event; give those that no later one can precede."""
         self._number += 1
         entry = self._entry(placed)
-        late = entry.beside != 0 or (placed.chain is None and bool(self._window) and entry < self._window[-1])
-        self.out_of_order += late
-        insort(self._window, entry)
+        if not self._window or entry > self._window[-1]:
+            self._window.append(entry)
+        else:
+            insort(self._window, entry)
+            self.out_of_order += entry.beside != 0 or placed.chain is None
         if len(self._window) >= 2 * _WINDOW:
             yield from self._give(_WINDOW)
 
@@ -66,9 +68,10 @@ class Order:
         oldest = self._number - 2 * _WINDOW
         self._chains = {name: chain[-_WINDOW:] for name, chain in self._chains.items() if chain[-1][2] >= oldest}
         for entry in given:
-            last_ns = entry.time_ns if self._last_ns is None else self._last_ns
-            self._last_ns = max(entry.time_ns, last_ns)
-            yield entry.event._replace(time_ns=self._last_ns)
+            if self._last_ns is None or entry.time_ns > self._last_ns:
+                self._last_ns = entry.time_ns
+            event = entry.event
+            yield event if event.time_ns == self._last_ns else event._replace(time_ns=self._last_ns)
 
     def _entry(self, placed: Placed) -> _Entry:
         event, device_ns, own = placed.event, placed.device_ns, self._number

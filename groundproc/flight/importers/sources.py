@@ -313,7 +313,8 @@ def _step_notes(path: Path, steady: Steady) -> list[str]:
         notes.append(
             f"{path}: {steady.out_of_range} stamps lie before 1970 or after 2038; their packets or frames are left out"
         )
-    if steady.moved_ns and steady.first_ns is not None:
+    # where the very first stamp was wild all others are right
+    if steady.moved_ns and steady.first_ns is not None and (steady.steps_ahead or not steady.wild_stamps):
         stamped, used = utc_text(steady.first_ns - steady.moved_ns), utc_text(steady.first_ns)
         notes.append(f"{path}: its computer had no clock, its stamps begin at {stamped}; taken to begin at {used}")
     return notes

@@ -16,8 +16,8 @@ from groundproc.flight.importers.devices import Reading, reading, stated_utc_ns
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.ordering import Order, Placed
 
-_EARLY_NS: Final = NS_PER_S // 10
-"""Nothing is received before it was sent; more than this, and the slew of a silence, is no jitter of stamps."""
+_JUMP_NS: Final = NS_PER_S // 2
+"""A device's clock that is set is set by more."""
 _CLOSE_NS: Final = 2 * NS_PER_S
 """A device's messages follow each other within this; more and it was silent."""
 _SAME_NS: Final = NS_PER_S // 10
@@ -92,22 +92,24 @@ class Steady:
     moved_ns: int = 0
     first_ns: int | None = None
     last_ns: int = 0
-    _levels: list[_Level] = field(default_factory=lambda: [_Level(0, confirmed=True)])
+    _levels: list[_Level] = field(default_factory=lambda: [_Level(0)])
     """The one in force last."""
-    _run: int = 0
-    """Messages on end at the level in force."""
+    _ran: tuple[_Level | None, int] = (None, 0)
+    """The level of the last message, and how many on end were at it."""
     _held: _Level | None = None
     """The last level that was confirmed."""
     _devices: dict[tuple[str, bytes], _Device] = field(default_factory=dict)
     _time_ns: int | None = None
-    """Time of the last event."""
+    """Time of the last event with a device's clock."""
+    _latest_ns: int = 0
+    """The latest time of all."""
     _waiting: list[Event] = field(default_factory=list)
     """Events without a device's clock: the next with one tells which level they are of."""
 
     def begin(self, moved_ns: int) -> None:
         """Add so much to all times; before the first event."""
         self.moved_ns = moved_ns
-        self._levels = [_Level(moved_ns, confirmed=True)]
+        self._levels = [_Level(moved_ns)]
 
     def __call__(self, events: Iterable[Event]) -> Iterator[Event]:
         """The events of the recording, put right."""
@@ -116,7 +118,8 @@ class Steady:
             yield from self._given(order.put(placed))
         yield from self._given(order.finish())
         self.out_of_order = order.out_of_order
-        self.wild_stamps += sum(level.hits for level in self._levels if not level.confirmed)
+        held = self._held or max(self._levels, key=lambda level: level.hits)
+        self.wild_stamps += sum(level.hits for level in self._levels if not level.confirmed and level is not held)
 
     def _given(self, events: Iterable[Event]) -> Iterator[Event]:
         for event in events:
@@ -141,9 +144,11 @@ class Steady:
                     yield from self._release(before_ns, None)
                 continue
             assert self._time_ns is not None
-            yield from self._release(before_ns, self._time_ns, stepped=self._levels[-1] is not level)
+            if self._waiting:
+                yield from self._release(before_ns, self._time_ns, stepped=self._levels[-1] is not level)
             chain = (read.device, event.topic, read.kind, self._devices[read.device].epoch)
-            yield Placed(event._replace(time_ns=self._time_ns), chain, device_ns)
+            self._latest_ns = max(self._latest_ns, self._time_ns)
+            yield Placed(_at(event, self._time_ns), chain, device_ns)
         yield from self._release(self._time_ns, None)
 
     def _take(self, raw_ns: int, read: Reading) -> int | None:
@@ -155,13 +160,18 @@ class Steady:
         step_ns = self._device_step(raw_ns, read, device)
         device_ns = device.time_ns + step_ns
         expected_ns = device_ns + device.base_ns
-        level = self._matching(raw_ns, expected_ns, step_ns, read.slack_ns)
+        level = self._matching(raw_ns, expected_ns, step_ns, read)
+        beyond_ns = raw_ns + self._levels[-1].offset_ns - expected_ns
         if level is not None:
             time_ns = raw_ns + level.offset_ns
             # delays only add: the base is that of the fastest, and follows the slower no quicker than clocks drift
             device.base_ns += min(time_ns - expected_ns, round(_SLEW * abs(step_ns)))
-        elif _goes_on(raw_ns, step_ns, raw_ns + self._levels[-1].offset_ns - expected_ns, read, device):
-            time_ns, level = expected_ns, self._new_level(expected_ns - raw_ns)
+        elif _goes_on(raw_ns, step_ns, beyond_ns, read, device):
+            time_ns = max(expected_ns, self._latest_ns) if step_ns >= 0 else expected_ns
+            level = self._new_level(time_ns - raw_ns)
+        elif abs(beyond_ns) < _JUMP_NS:  # it came ahead of others
+            level = self._levels[-1]
+            time_ns = raw_ns + level.offset_ns
         else:
             level = self._after_event(raw_ns)
             time_ns = raw_ns + level.offset_ns
@@ -200,19 +210,20 @@ class Steady:
         turns = round(nearest_ns / read.wrap_ns) if abs(nearest_ns) < _YEAR_NS else int(step_ns < 0)
         return step_ns + max(turns, 0) * read.wrap_ns
 
-    def _matching(self, raw_ns: int, expected_ns: int, step_ns: int, slack_ns: int) -> _Level | None:
-        """The level, the newest first, at which a stamp is what a device's clock lets expect."""
-        early_ns = _EARLY_NS + round(_SLEW * abs(step_ns))
-        for level in reversed(self._levels):
-            if -early_ns <= raw_ns + level.offset_ns - expected_ns <= slack_ns + early_ns:
-                return level
-        return None
+    def _matching(self, raw_ns: int, expected_ns: int, step_ns: int, read: Reading) -> _Level | None:
+        """The level at which a stamp is nearest to what a device's clock lets expect, the newest first; None where it is at none."""
+        early_ns = read.early_ns + round(_SLEW * abs(step_ns))
+        best = self._levels[-1]
+        if abs(raw_ns + best.offset_ns - expected_ns) <= early_ns:
+            return best
+        best = min(reversed(self._levels), key=lambda level: abs(raw_ns + level.offset_ns - expected_ns))
+        return best if -early_ns <= raw_ns + best.offset_ns - expected_ns <= read.slack_ns + early_ns else None
 
     def _after_event(self, raw_ns: int) -> _Level:
         """The level after a device's clock was set or began anew: the one in force, where time goes on with it."""
         level = self._levels[-1]
         passed_ns = 0 if self._time_ns is None else raw_ns + level.offset_ns - self._time_ns
-        if self._time_ns is None or -_EARLY_NS <= passed_ns < _YEAR_NS:
+        if self._time_ns is None or -_JUMP_NS <= passed_ns < _YEAR_NS:
             return level
         return self._new_level(self._time_ns - raw_ns)
 
@@ -226,19 +237,18 @@ class Steady:
     def _enter(self, level: _Level) -> None:
         """Make a level the one in force, and count a step once it has lasted."""
         level.hits += 1
-        if level is self._levels[-1] and self._run:
-            self._run += 1
-        else:
-            self._run = 1
+        self._ran = (level, self._ran[1] + 1 if self._ran[0] is level else 1)
+        if level is not self._levels[-1]:
             self._levels.remove(level)
             self._levels.append(level)
-        held = self._held or next(each for each in self._levels if each.confirmed)
-        self._held = held
-        if level is not held and self._run >= _FEWEST:
-            level.confirmed, self._held = True, level
+        held = self._held
+        if level is held or self._ran[1] < _FEWEST:
+            return
+        level.confirmed, self._held = True, level
+        if held is not None:
             self.steps_back += level.offset_ns > held.offset_ns
             self.steps_ahead += level.offset_ns < held.offset_ns
-            self.stepped_ns = level.offset_ns - self.moved_ns
+            self.stepped_ns += level.offset_ns - held.offset_ns
 
     def _release(self, before_ns: int | None, after_ns: int | None, *, stepped: bool = False) -> Iterator[Placed]:
         """Events without a device's clock, between two times that are sure; None where there is none.
@@ -254,7 +264,8 @@ class Steady:
                 time_ns = self._between(event.time_ns, first_ns, after_ns)
                 if stepped:
                     time_ns = before_ns = min(max(time_ns, first_ns), after_ns)
-            yield Placed(event._replace(time_ns=time_ns), None, 0)
+            self._latest_ns = max(self._latest_ns, time_ns)
+            yield Placed(_at(event, time_ns), None, 0)
 
     def _between(self, raw_ns: int, first_ns: int, last_ns: int) -> int:
         for level in reversed(self._levels):
@@ -275,6 +286,10 @@ class Steady:
         self._enter(level)
         self._time_ns = raw_ns + level.offset_ns
         return self._time_ns
+
+
+def _at(event: Event, time_ns: int) -> Event:
+    return event if event.time_ns == time_ns else event._replace(time_ns=time_ns)
 
 
 def _goes_on(raw_ns: int, step_ns: int, beyond_ns: int, read: Reading, device: _Device) -> bool:

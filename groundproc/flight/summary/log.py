@@ -147,9 +147,7 @@ class LogSummary:
         }
 
     def _claims(self) -> tuple[dict[str, int], bool]:
-        """What each source says that UTC was when the first SYSTEM_TIME came, else the first fix of the lidar's GPS; and whether that of
-        the lidar is exact.
-        """
+        """What each source says that UTC was at the first SYSTEM_TIME, else at the lidar's first fix; and whether the lidar's is exact."""
         pilot = next((each for _, each in self.links.values() if each.first_utc_ns is not None), None)
         fix = self.position.first_utc_ns()
         host_ns = pilot.first_utc_received_ns if pilot is not None else self.position.first_fix_received_ns
