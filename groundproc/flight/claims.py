@@ -13,7 +13,7 @@ from typing import Final
 from flightlog import clock
 from flightlog.clock import utc_text
 from flightlog.constants import NS_PER_S
-from groundproc.flight.positions.scales import ERA_NS
+from groundproc.flight.positions.scales import EPOCH_NS, ERA_NS
 
 GPRMC, SYSTEM_TIME, GPS_RAW, HOST = "gprmc", "system_time", "gps_raw", "host"
 NAMES: Final = {
@@ -22,6 +22,7 @@ NAMES: Final = {
 }  # fmt: skip
 FIRST_NS: Final = 1_262_304_000 * NS_PER_S
 """2010-01-01: no HDL-32E was sold and no MAVLink spoken before, so that a receiver's earlier date is of another era."""
+_DAY_NS: Final = 86_400 * NS_PER_S
 _NEAR_NS: Final = 7 * 86_400 * NS_PER_S
 """Claims of one era lie together within this."""
 _EXACT_NS: Final = 400_000_000
@@ -51,6 +52,12 @@ class Settled:
     doubts: tuple[str, ...] = ()
 
 
+def can_be(utc_ns: int) -> bool:
+    """Whether a receiver's date can be one, of whichever era: not the first day of an era, which is what it says that knows none."""
+    since_ns = utc_ns - EPOCH_NS
+    return since_ns >= 0 and utc_ns < clock.PLAUSIBLE_UTC_NS[1] and since_ns % ERA_NS >= _DAY_NS
+
+
 def settled(claims: Mapping[str, int], *, exact: bool = True) -> Settled:
     """Hold claims against each other.
 
@@ -65,7 +72,7 @@ def settled(claims: Mapping[str, int], *, exact: bool = True) -> Settled:
     mended: list[str] = []
     doubts: list[str] = []
     for name, utc_ns in claims.items():
-        if clock.is_plausible(utc_ns):
+        if clock.is_plausible(utc_ns) if name == HOST else can_be(utc_ns):
             add[name] = 0
         elif name != HOST:
             doubts.append(f"{NAMES[name]} states {utc_text(utc_ns)}, which cannot be; not used")

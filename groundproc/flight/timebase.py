@@ -13,7 +13,7 @@ from flightlog.errors import ClockError
 from flightlog.nmea import Rmc
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.claims import GPRMC, GPS_RAW, HOST, SYSTEM_TIME
-from groundproc.flight.positions.scales import in_era
+from groundproc.flight.positions.scales import EPOCH_NS, in_era
 
 LARGEST_DRIFT: Final = 300e-6
 """Drift of one crystal against another beyond which a fit has followed the jitter [s/s]."""
@@ -183,7 +183,7 @@ def boot_utc(boot: Boot) -> UtcTie | None:
             boot.tables[message][field], _LATEST_US
         )  # as unsigned numbers they exceed what nanoseconds can
         unix_ns = unix_us.astype(np.int64) * NS_PER_US
-        known = (unix_ns >= clock.PLAUSIBLE_UTC_NS[0]) & (unix_ns < clock.PLAUSIBLE_UTC_NS[1])
+        known = (unix_ns >= EPOCH_NS) & (unix_ns < clock.PLAUSIBLE_UTC_NS[1])
         if not known.any():
             continue
         offset_ns = unix_ns[known] - boot.stamps_ns[message][known]

@@ -7,6 +7,7 @@ from typing import Any, Final
 from flightlog import clock
 from flightlog.constants import NS_PER_S
 from flightlog.mavlink import AUTOPILOT_INVALID, Frame, message_id, payload_dtype
+from groundproc.flight.claims import can_be
 
 _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
@@ -87,7 +88,7 @@ class TelemetrySummary:
             self._system_time(frame.time_ns, _value(frame, "time_unix_usec") * 1000)
 
     def _system_time(self, received_ns: int, utc_ns: int) -> None:
-        if clock.is_plausible(utc_ns):
+        if can_be(utc_ns):
             if self.first_utc_ns is None:
                 self.first_utc_ns, self.first_utc_received_ns = utc_ns, received_ns
         else:
