@@ -8,12 +8,15 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog.clock import utc_text
+from flightlog.errors import ClockError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import FrameParser
 from flightlog.mount import Mount
 from groundproc.cli import main
 from groundproc.flight.claims import FIRST_NS, GPRMC, HOST, SYSTEM_TIME, settled
 from groundproc.flight.flight import read_flight
+from groundproc.flight.importers.tlog import TlogCount
+from groundproc.flight.importers.tlog import records as tlog_records
 from groundproc.flight.summary.log import summarise
 from groundproc.flight.summary.telemetry import TelemetrySummary
 from groundproc.flight.timeline import legs
@@ -112,3 +115,20 @@ def test_case_of_a_receiver_an_era_behind(cases: Path, tmp_path: Path, capsys: p
     said = describe_leg(leg)["utc"]
     assert "1024 weeks behind" in said["mended"][0]
     assert said["warnings"] == []
+
+
+def test_receive_times_of_another_rate_than_the_autopilots_clock_tie_nothing(cases: Path, tmp_path: Path) -> None:
+    """A link whose autopilot's clock runs at 4.3 times the receive times, as in one recorded log: no sigma makes that a tie."""
+    folder, log, link = cases / "two_vehicles", tmp_path / "a.mcap", tmp_path / "t.tlog"
+    count = TlogCount()
+    frames = [(t, data) for t, data in tlog_records((cases / "two_vehicles/t.tlog").read_bytes(), count)]
+    first_ns = frames[0][0]
+    stamps_us = [(first_ns + round((t - first_ns) / 4.3)) // 1000 & ~3 for t, _ in frames]
+    link.write_bytes(b"".join(us.to_bytes(8, "big") + data for us, (_, data) in zip(stamps_us, frames, strict=True)))
+    assert main(["import", "--pcap", str(folder / "l.pcap"), "--mavlink", str(link), "-o", str(log)]) == 0
+    with LogReader(log) as reader:
+        flight = read_flight([reader], "ins")
+    with pytest.raises(
+        ClockError, match=r"autopilot: its clock ran at 4\.3\d* times the receive times, expected 1 within 300 ppm"
+    ):
+        legs(flight.runs, flight.boots, Mount().mat_ins_lidar(), "host")
