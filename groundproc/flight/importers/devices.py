@@ -5,8 +5,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flightlog import clock, hdl32e, mavlink, nmea, records
+from flightlog import hdl32e, mavlink, nmea, records
 from flightlog.constants import HOUR_NS, NS_PER_MS, NS_PER_S, NS_PER_US
+from groundproc.flight import claims
 from groundproc.flight.importers.joining import Event
 
 
@@ -81,12 +82,17 @@ def _boot_place(number: int) -> int | None:
 
 def stated_utc_ns(event: Event) -> int | None:
     """UTC that an event states: SYSTEM_TIME of an autopilot, or the sentence of a valid fix in a position packet; None for others."""
-    utc_ns = None
     if event.topic == records.POSITION.topic and len(event.data) == hdl32e.POSITION_BYTES:
         fix = nmea.parse_rmc(event.data[_SENTENCE])
-        utc_ns = fix.utc_ns if fix is not None and fix.valid else None
-    elif event.topic.startswith(records.MAVLINK.topic):
+        return _held(claims.GPRMC, fix.utc_ns) if fix is not None and fix.valid else None
+    if event.topic.startswith(records.MAVLINK.topic):
         frame = mavlink.frame_of(event.data)
         if frame is not None and frame.message_id == _SYSTEM_TIME:
-            utc_ns = int.from_bytes(frame.payload[:8], "little") * NS_PER_US
-    return utc_ns if utc_ns is not None and clock.is_plausible(utc_ns) else None
+            return _held(claims.SYSTEM_TIME, int.from_bytes(frame.payload[:8], "little") * NS_PER_US)
+    return None
+
+
+def _held(name: str, utc_ns: int) -> int | None:
+    """What a claim is worth alone: of the era that it can be of."""
+    add_ns = claims.settled({name: utc_ns}).add_ns.get(name)
+    return None if add_ns is None else utc_ns + add_ns

@@ -18,7 +18,7 @@ from flightlog.logfile import LogWriter
 from groundproc import sensors
 from groundproc.flight.importers.joining import Event, Joiner
 from groundproc.flight.importers.sources import Capture, DataflashLog, Ports, Source, Tlog, open_mavlink
-from groundproc.flight.importers.steady import moves
+from groundproc.flight.importers.starting import moves
 from groundproc.flight.lidar import STATED
 from groundproc.sensors.model import Lidar
 

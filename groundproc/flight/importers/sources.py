@@ -18,7 +18,8 @@ from flightlog.errors import CaptureError
 from groundproc import sensors
 from groundproc.flight.importers import pcap, tlog, udp
 from groundproc.flight.importers.joining import Event, LogMessage
-from groundproc.flight.importers.steady import Start, Steady, start_of
+from groundproc.flight.importers.starting import Start, start_of
+from groundproc.flight.importers.steady import Steady
 from groundproc.flight.lidar import recognised
 from groundproc.sensors.model import Lidar
 

@@ -6,13 +6,13 @@ to the next and the stamp did not, the stamp is wrong. Where the device's clock 
 went on by as much, there was silence.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
 from flightlog import clock
 from flightlog.constants import HOUR_NS, NS_PER_S
-from groundproc.flight.importers.devices import Reading, reading, stated_utc_ns
+from groundproc.flight.importers.devices import Reading, reading
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.ordering import Order, Placed
 
@@ -28,11 +28,9 @@ _SLEW: Final = 1e-3
 """A computer's clock is slewed by 500 ppm at most (RFC 5905, section 12), and crystals differ by 100 ppm."""
 _YEAR_NS: Final = 365 * 86_400 * NS_PER_S
 """A silence is shorter; a computer that had no clock gains more when it is set."""
-_DAY_NS: Final = 86_400 * NS_PER_S
 _LEVELS: Final = 16
 _FEWEST: Final = 8
 """So many messages on end at another level are a clock that was set; fewer are wild stamps."""
-_HEAD: Final = 256
 _WAITING: Final = 1024
 
 
@@ -130,6 +128,12 @@ class Steady:
                 self.first_ns = event.time_ns
             self.last_ns = event.time_ns
             yield event
+
+    def dated_ns(self) -> int | None:
+        """What makes times of stamps [ns] at the level that most messages have of those whose stamps can be dates; None without such."""
+        last_ns = self._time_ns or 0
+        able = [level for level in self._levels if level.hits and clock.is_plausible(last_ns - level.offset_ns)]
+        return max(able, key=lambda level: level.hits).offset_ns if able else None
 
     def judged(self, events: Iterable[Event]) -> Iterator[Placed]:
         """Events with mended times, in the order of the recording."""
@@ -305,83 +309,3 @@ def _goes_on(raw_ns: int, step_ns: int, beyond_ns: int, read: Reading, device: _
     numbers = (read.sequence, device.sequence)
     skipped = 0 if numbers[0] is None or numbers[1] is None else (numbers[0] - numbers[1] - 1) % 256
     return abs(step_ns) < _CLOSE_NS and abs(step_ns) <= abs(passed_ns) and skipped <= _SKIPPED
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """What the beginning of a recording says of its computer's clock.
-
-    Attributes
-    ----------
-    moved_ns : int
-        What to add to all times for the first stamps that can be a date to be right.
-    known : bool
-        Whether any stamps can.
-    first_ns : int
-        Time of the first event, `moved_ns` added.
-    stated_ns : int or None
-        Where no stamp can be a date: what a device's own statement of UTC asks to be added; None where there is none.
-    """
-
-    moved_ns: int
-    known: bool
-    first_ns: int
-    stated_ns: int | None
-
-
-def start_of(again: Callable[[], Iterable[Event]]) -> Start | None:
-    """Look at the beginning of a recording; at all of it where its stamps are no dates. None where it holds nothing.
-
-    Parameters
-    ----------
-    again : callable
-        Gives the events, from the first on.
-    """
-    trial, first_ns, stated_ns = Steady(), None, None
-    for number, placed in enumerate(trial.judged(again())):
-        if first_ns is None:
-            first_ns = placed.event.time_ns
-        if stated_ns is None and (utc_ns := stated_utc_ns(placed.event)) is not None:
-            stated_ns = utc_ns - placed.event.time_ns
-        if number >= _HEAD and _dated(trial) is not None:
-            break
-    if first_ns is None:
-        return None
-    level = _dated(trial)
-    if level is None:
-        return Start(0, False, first_ns, stated_ns)
-    return Start(-level.offset_ns, True, first_ns - level.offset_ns, None)
-
-
-def _dated(trial: Steady) -> _Level | None:
-    """Of the levels whose stamps can be dates the one that most messages have; None where no message has such."""
-    time_ns = trial._time_ns or 0
-    able = [level for level in trial._levels if level.hits and clock.is_plausible(time_ns - level.offset_ns)]
-    return max(able, key=lambda level: level.hits, default=None)
-
-
-def moves(starts: Sequence[Start | None]) -> list[int]:
-    """What to add to the times of recordings of one flight [ns].
-
-    A recording without a date takes that which a device states in it, else that of one whose stamps begin within a day of its own: they
-    are of one computer. Else it begins where the first of those with a date does. Without any date stamps stay what they are, but within
-    the range of a log.
-
-    Parameters
-    ----------
-    starts : sequence of Start or None
-    """
-    known = [start.first_ns for start in starts if start is not None and start.known]
-    stated = [start for start in starts if start is not None and not start.known and start.stated_ns is not None]
-    return [0 if start is None else start.moved_ns if start.known else _move(start, known, stated) for start in starts]
-
-
-def _move(start: Start, known: list[int], stated: list[Start]) -> int:
-    if start.stated_ns is not None:
-        return start.stated_ns
-    for other in stated:
-        if other.stated_ns is not None and abs(other.first_ns - start.first_ns) < _DAY_NS:
-            return other.stated_ns
-    if known:
-        return min(known) - start.first_ns
-    return 0 if 0 <= start.first_ns < clock.PLAUSIBLE_UTC_NS[0] else -(start.first_ns // _DAY_NS) * _DAY_NS

@@ -13,7 +13,8 @@ from flightlog.logfile import LogReader
 from groundproc.cli import main
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.sources import Capture, Ports, Tlog
-from groundproc.flight.importers.steady import Steady, moves, start_of
+from groundproc.flight.importers.starting import Start, moves, start_of
+from groundproc.flight.importers.steady import Steady
 from groundproc.flight.summary.log import summarise
 
 START_NS = 1_779_272_223_000_000_000
@@ -160,6 +161,15 @@ def test_a_recording_without_any_date_begins_where_the_others_do() -> None:
     assert moves([start_of(lambda: iter(undated)), None]) == [0, 0]
     alone, _ = put_right(beyond)
     assert 0 <= alone[0].time_ns < DAY_NS
+
+
+def test_undated_recordings_of_one_computer_keep_its_clock_between_them() -> None:
+    stated = 1_779_271_923 * NS_PER_S
+    lidar, link = Start(0, False, 300 * NS_PER_S, stated - NS_PER_S), Start(0, False, 301 * NS_PER_S, stated)
+    assert moves([lidar, link]) == [stated - NS_PER_S] * 2
+    assert moves([Start(0, False, 300 * NS_PER_S, None), link]) == [stated] * 2
+    # of two computers, each as its devices state it
+    assert moves([Start(0, False, 900 * NS_PER_S, stated - 600 * NS_PER_S), link]) == [stated - 600 * NS_PER_S, stated]
 
 
 @pytest.fixture
