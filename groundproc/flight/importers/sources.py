@@ -12,12 +12,11 @@ from typing import Any, BinaryIO, Final, Protocol, cast
 import numpy as np
 
 from flightlog import dataflash, hdl32e, records
-from flightlog.clock import utc_text
-from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
 from groundproc import sensors
 from groundproc.flight.importers import pcap, tlog, udp
 from groundproc.flight.importers.joining import Event, LogMessage
+from groundproc.flight.importers.mended import mended
 from groundproc.flight.importers.starting import Start, start_of
 from groundproc.flight.importers.steady import Steady
 from groundproc.flight.lidar import recognised
@@ -174,7 +173,7 @@ class Capture:
         if self.found.untimed or self.found.borrowed_times:
             count = self.found.untimed + self.found.borrowed_times
             notes.append(f"{self.path}: {count} packets carry no time of their own")
-        return notes + _step_notes(self.path, self.steady)
+        return notes + [f"{self.path}: {said}" for said in mended(self.steady)]
 
     def close(self) -> None:
         """See Source."""
@@ -218,7 +217,7 @@ class Tlog:
             notes.append(f"{self.path}: {self.count.bad_bytes} bytes belong to no good MAVLink frame")
         if self.count.cut:
             notes.append(f"{self.path}: ends within a record")
-        return notes + _step_notes(self.path, self.steady)
+        return notes + [f"{self.path}: {said}" for said in mended(self.steady)]
 
     def close(self) -> None:
         """See Source."""
@@ -295,27 +294,3 @@ def _facts(source: Source, size: int, sha256: str, counters: dict[str, Any]) -> 
         "sha256": sha256,
         "counters": {name: value for name, value in counters.items() if not name.startswith("_")},
     }
-
-
-def _step_notes(path: Path, steady: Steady) -> list[str]:
-    notes = []
-    if steady.steps_back or steady.steps_ahead:
-        count = {"back": steady.steps_back, "ahead": steady.steps_ahead}
-        times = " and ".join(f"{way} {number} times" for way, number in count.items() if number)
-        seconds = abs(steady.stepped_ns) / NS_PER_S
-        notes.append(
-            f"{path}: its clock was set {times}, by {seconds:.3f} s in all; times carried on by the devices' clocks"
-        )
-    if steady.wild_stamps:
-        notes.append(f"{path}: {steady.wild_stamps} stamps were wild, mended by the devices' clocks")
-    if steady.out_of_order:
-        notes.append(f"{path}: {steady.out_of_order} packets or frames were out of order, put in their place")
-    if steady.out_of_range:
-        notes.append(
-            f"{path}: {steady.out_of_range} stamps lie before 1970 or after 2038; their packets or frames are left out"
-        )
-    # where the very first stamp was wild all others are right
-    if steady.moved_ns and steady.first_ns is not None and (steady.steps_ahead or not steady.wild_stamps):
-        stamped, used = utc_text(steady.first_ns - steady.moved_ns), utc_text(steady.first_ns)
-        notes.append(f"{path}: its computer had no clock, its stamps begin at {stamped}; taken to begin at {used}")
-    return notes
