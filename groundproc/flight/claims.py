@@ -17,7 +17,7 @@ from groundproc.flight.positions.scales import EPOCH_NS, ERA_NS
 
 GPRMC, SYSTEM_TIME, GPS_RAW, HOST = "gprmc", "system_time", "gps_raw", "host"
 NAMES: Final = {
-    GPRMC: "the lidar's GPS sentences (GPRMC)", SYSTEM_TIME: "the autopilot's SYSTEM_TIME", GPS_RAW: "the autopilot's GPS_RAW_INT",
+    GPRMC: "the lidar's GPS (GPRMC)", SYSTEM_TIME: "the autopilot's SYSTEM_TIME", GPS_RAW: "the autopilot's GPS_RAW_INT",
     HOST: "the recording computer",
 }  # fmt: skip
 FIRST_NS: Final = 1_262_304_000 * NS_PER_S
