@@ -21,6 +21,8 @@ _LEAP_DATES: Final = (
 LEAP_UNIX_S: Final = tuple(int(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) for day in _LEAP_DATES)
 """Unix seconds at which GPS time gained one more second on UTC (IERS Bulletin C; none announced since 2017)."""
 
+PLAUSIBLE_UTC_NS: Final = (946_684_800 * NS_PER_S, (1 << 31) * NS_PER_S)
+"""2000 to 2038, to the end of the 32-bit seconds of a log's records: what lies outside is no date, but a counter or a fault."""
 _U32: Final = 1 << 32
 _CALENDAR_NS: Final = (-62_135_596_800 * NS_PER_S, 253_402_300_799 * NS_PER_S)
 """Years 1 to 9999."""
@@ -53,6 +55,11 @@ def utc_text(utc_ns: int) -> str:
     if not _CALENDAR_NS[0] <= utc_ns <= _CALENDAR_NS[1]:
         return f"{utc_ns / NS_PER_S:.3f} s after 1970"
     return datetime.fromtimestamp(utc_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def is_plausible(utc_ns: int) -> bool:
+    """Whether a Unix time can be the date of a recording."""
+    return PLAUSIBLE_UTC_NS[0] <= utc_ns < PLAUSIBLE_UTC_NS[1]
 
 
 def unwrap_u32(values: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:

@@ -194,6 +194,14 @@ def _read_frame(buffer: bytes, offset: int, size: int) -> Frame | None:
     return Frame(0, system, component, message_id, sequence, version, extra is not None, data)
 
 
+def frame_of(data: bytes) -> Frame | None:
+    """The frame that some bytes begin with, not timed; None where none begins, its end is missing or its checksum is wrong."""
+    if not data or data[0] not in (_STX_1, _STX_2):
+        return None
+    size = _frame_size(data, 0)
+    return _read_frame(data, 0, size) if size and size <= len(data) else None
+
+
 def message_id(name: str) -> int:
     """Id of a message of the dialect, by its name."""
     return _ids()[name]
@@ -223,6 +231,11 @@ def payload_dtype(number: int) -> np.dtype[np.void]:
         else:
             fields.append((name, code, (length,)) if length > 1 else (name, code))
     return np.dtype(fields)
+
+
+def message_name(number: int) -> str | None:
+    """Name of the message with an id; None for one outside the dialect."""
+    return _NAMES.get(number)
 
 
 def field_offset(name: str, field: str) -> int | None:

@@ -1,6 +1,6 @@
 """Times of points in files: adjusted standard GPS time, or seconds of the GPS week; to UTC and back."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -10,7 +10,15 @@ import numpy.typing as npt
 from flightlog import clock
 from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
-from groundproc.flight.positions.scales import EPOCH_NS, WEEK_NS, utc_from_gps_calendar
+from groundproc.flight.positions.scales import (
+    EPOCH_NS,
+    WEEK_NS,
+    WEEK_S,
+    calendar_of_week,
+    gps_calendar_from_utc,
+    utc_from_gps_calendar,
+    week_start_s,
+)
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -34,9 +42,9 @@ class Clock:
     Attributes
     ----------
     week : int or None
-        GPS week of files that count seconds of the week.
+        GPS week in which files begin that count seconds of the week.
     near_utc_ns : int or None
-        A time of the flight, where the trajectory knows it: gives files with seconds of the week theirs.
+        A time of the flight, where the trajectory knows it: gives each point with seconds of the week its week, and goes before `week`.
     """
 
     week: int | None = None
@@ -52,18 +60,27 @@ class Clock:
         """
         if not np.isfinite(time_s).all() or not (time_s != 0.0).any():
             raise CaptureError(f"{path}: gps_time is {_example(time_s)}, expected the time of each point")
+        if week_time:
+            if self.week is None and self.near_utc_ns is None:
+                raise CaptureError(f"{path}: its times are seconds of the GPS week; give the week with --week")
+            near = None if self.near_utc_ns is None else int(gps_calendar_from_utc(np.array([self.near_utc_ns]))[0])
+            return utc_from_gps_calendar(calendar_of_week(time_s, week=self.week, near_ns=near))
         whole = np.floor(time_s)
         nano = whole.astype(np.int64) * NS_PER_S + np.rint((time_s - whole) * 1e9).astype(np.int64)
-        if not week_time:
-            return utc_from_gps_calendar(nano + _ADJUSTED_S * NS_PER_S + EPOCH_NS)
-        if self.week is not None:
-            week = self.week
-        elif self.near_utc_ns is not None:
-            # the leap seconds, 18 of 604800, do not matter here
-            week = round((self.near_utc_ns - EPOCH_NS - int(nano[len(nano) // 2])) / WEEK_NS)
-        else:
-            raise CaptureError(f"{path}: its times are seconds of the GPS week; give the week with --week")
-        return utc_from_gps_calendar(nano + week * WEEK_NS + EPOCH_NS)
+        return utc_from_gps_calendar(nano + _ADJUSTED_S * NS_PER_S + EPOCH_NS)
+
+    def begun(self, time_s: Array) -> "Clock":
+        """The clock for the rest of a file whose first stamps are seconds of the week, shape (n,): near to where it begins."""
+        if self.near_utc_ns is not None or self.week is None or not len(time_s) or not np.isfinite(time_s).all():
+            return self
+        near = np.array([EPOCH_NS + self.week * WEEK_NS + week_start_s(time_s) * NS_PER_S])
+        return replace(self, near_utc_ns=int(utc_from_gps_calendar(near)[0]))
+
+
+def is_week_time(time_s: Array) -> bool:
+    """Whether stamps, shape (n,), can be seconds of the week: most of them; single ones may be wild."""
+    with np.errstate(invalid="ignore"):
+        return bool(np.mean((time_s >= 0.0) & (time_s < 2.0 * WEEK_S)) > 0.5)
 
 
 def _example(time_s: Array) -> str:

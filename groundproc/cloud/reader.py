@@ -13,12 +13,10 @@ import pyproj
 from laspy.header import GpsTimeType
 from pyproj.exceptions import CRSError
 
-from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
 from groundproc.cloud.dimensions import TABLE, Dimension, in_order
-from groundproc.cloud.gpstime import Clock
+from groundproc.cloud.gpstime import Clock, is_week_time
 from groundproc.cloud.points import Points
-from groundproc.flight.positions.scales import WEEK_NS
 
 CHUNK: Final = 1_000_000
 """Points that are in memory at once."""
@@ -97,7 +95,7 @@ def look(path: Path) -> Cloud:
         if weekly:
             # many programs leave the bit unset with times that no week has
             time = np.asarray(next(_records(path, reader)).gps_time, np.float64)
-            weekly = bool(((time >= 0.0) & (time < 2.0 * WEEK_NS / NS_PER_S)).all())
+            weekly = is_week_time(time)
         return Cloud(path, header.point_count, columns, timed, weekly, crs)
 
 
@@ -127,7 +125,9 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
             xyz = np.stack([record.x, record.y, record.z], axis=1).astype(np.float64)
             time_ns = np.zeros(len(record), np.int64)
             if clock is not None:
-                time_ns = clock.utc_ns(cloud.path, cloud.week_time, np.asarray(record.gps_time, np.float64))
+                time_s = np.asarray(record.gps_time, np.float64)
+                clock = clock.begun(time_s) if cloud.week_time else clock
+                time_ns = clock.utc_ns(cloud.path, cloud.week_time, time_s)
             values = {entry.name: _column(entry, record) for entry in wanted}
             yield Chunk(Points(time_ns, xyz, values), record)
         if seen != cloud.points:

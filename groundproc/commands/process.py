@@ -146,6 +146,7 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         + (f"; {track['note']}" if track["note"] else ""),
         f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
         + (f"; {sync['note']}" if sync["note"] else ""),
+        *dict.fromkeys(f"UTC: {said}" for leg in quality["legs"] for said in leg["utc"]["mended"]),
         *_control_lines(quality.get(track["method"], {}).get("control")),
         _mount_line(quality["mount"]),
         *_where(folder),

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from flightlog.errors import CoverageError, LogError, UsageError
 from groundproc.estimation.method import Given, Method, Progress
+from groundproc.estimation.tiesigma import with_tie_sigma
 from groundproc.flight.timeline import ties_of
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.survey import Survey
@@ -44,8 +45,11 @@ def estimate(given: Given, progress: Progress) -> Estimate:
                 raise
             reasons.append(f"not {name}, because {str(error).removeprefix(f'{name}: ')}")
             continue
+        trajectory, warning = with_tie_sigma(made.trajectory, given.timeline)
         return replace(
             made,
+            trajectory=trajectory,
+            warning="; ".join(filter(None, (made.warning, warning))),
             method=name,
             note="; ".join(reasons),
             corrections=made.corrections if given.survey.lasers == ESTIMATE else given.corrections,

@@ -16,7 +16,7 @@ from flightlog.clock import utc_text
 from flightlog.constants import NS_PER_S
 from flightlog.errors import ClockError, SyncError
 from flightlog.nmea import Rmc
-from groundproc.flight import sync, timebase
+from groundproc.flight import claims, sync, timebase
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.sync import GyroTrack, Sync
 from groundproc.flight.timebase import HostLine, UtcTie
@@ -190,25 +190,22 @@ def legs(runs: Sequence[LidarRun], boots: Sequence[Boot], mat_ins_lidar: Array, 
 
     Raises
     ------
-    ClockError
-        No pair overlaps.
     SyncError
         `how` is "gyro" and the gyros do not tell.
+    ClockError
+        No pair overlaps; or the gyros do not tell, and a clock runs at another rate than the receive times.
     """
     found: list[Leg] = []
     for number, run in enumerate(runs):
         line: tuple[Line, ...] | None = None
-        tie = timebase.lidar_utc(run.fixes)
-        if tie is not None:
-            line = (Line(tie.offset_ns),)
+        tie: UtcTie | None = None
         for boot in boots:
             boot_line = _overlap(run, boot)
             if boot_line is None:
                 continue
             match = _synchronise(run, boot, boot_line, mat_ins_lidar, how)
             if line is None or tie is None:
-                tie = timebase.boot_utc(boot) or timebase.host_utc(boot_line, boot_line.reference_ns)
-                line = (_line(match), Line(tie.offset_ns))
+                tie, line = _utc(run, boot, boot_line, match)
             last_lidar_ns = run.line.device_ns(run.last_receive_ns)
             found.append(Leg(boot, number, match, tie, line, run.first_receive_ns, run.last_receive_ns, last_lidar_ns))
     if not found:
@@ -217,6 +214,26 @@ def legs(runs: Sequence[LidarRun], boots: Sequence[Boot], mat_ins_lidar: Array, 
             "of both computers right?"
         )
     return found
+
+
+def _utc(run: LidarRun, boot: Boot, boot_line: HostLine, match: Sync) -> tuple[UtcTie, tuple[Line, ...]]:
+    """What says which UTC it is, held against all else that says so; and from lidar time to it."""
+    lidar, pilot = timebase.lidar_utc(run.fixes), timebase.boot_utc(boot)
+    lidar_ns = run.line.reference_ns
+    boot_ns = int(_line(match)(np.array([lidar_ns]))[0])
+    host = timebase.host_utc(boot_line, boot_ns)
+    claimed = {claims.HOST: boot_ns + host.offset_ns}
+    if lidar is not None:
+        claimed[lidar.source] = lidar_ns + lidar.offset_ns
+    if pilot is not None:
+        claimed[pilot.source] = boot_ns + pilot.offset_ns
+    held = claims.settled(claimed)
+    tie = next((each for each in (lidar, pilot) if each is not None and each.source in held.add_ns), host)
+    tie = replace(tie, offset_ns=tie.offset_ns + held.add_ns.get(tie.source, 0), mended=held.mended, doubts=held.doubts)
+    return tie, (Line(tie.offset_ns),) if tie is not host and tie.source == claims.GPRMC else (
+        _line(match),
+        Line(tie.offset_ns),
+    )
 
 
 def _overlap(run: LidarRun, boot: Boot) -> HostLine | None:
@@ -231,13 +248,42 @@ def _overlap(run: LidarRun, boot: Boot) -> HostLine | None:
 def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: Array, how: str) -> Sync:
     host = _host_sync(run, boot_line)
     if how == "host":
+        _check_rates(run, boot_line, "")
         return host
     try:
-        return _gyro_sync(run, boot, mat_ins_lidar, host)
+        found = _gyro_sync(run, boot, mat_ins_lidar, host)
+        return _checked_drift(found)
     except SyncError as error:
         if how == "gyro":
             raise
+        _check_rates(run, boot_line, f"; and {error}")
         return replace(host, note=f"receive times only, because: {error}")
+
+
+def _checked_drift(found: Sync) -> Sync:
+    """Refuse gyros that fit with a drift that no two crystals have."""
+    if abs(found.drift_ppm) > timebase.LARGEST_DRIFT * 1e6 + 3.0 * found.sigma_drift_ppm:
+        raise SyncError(
+            f"gyros of lidar and autopilot: they fit with a drift of {found.drift_ppm:.0f} ppm, expected at most "
+            f"{timebase.LARGEST_DRIFT * 1e6:.0f} between two crystals"
+        )
+    return found
+
+
+def _check_rates(run: LidarRun, boot_line: HostLine, why: str) -> None:
+    """Refuse receive times as a tie where a device's clock runs at another rate than they do.
+
+    Raises
+    ------
+    ClockError
+    """
+    for name, line in (("lidar", run.line), ("autopilot", boot_line)):
+        if line.rate != 1.0:
+            raise ClockError(
+                f"{name}: its clock ran at {line.rate:.4g} times the receive times, expected 1 within "
+                f"{timebase.LARGEST_DRIFT * 1e6:.0f} ppm, so that receive times cannot tie lidar and autopilot{why}; was the "
+                "recording made of a simulator that does not run in real time, or were its stamps changed?"
+            )
 
 
 def _host_sync(run: LidarRun, boot_line: HostLine) -> Sync:

@@ -81,7 +81,12 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
         "lidar_run": leg.run,
         "attitude_from": ins.attitude_source(leg.boot),
         "position_from": ins.position_source(leg.boot),
-        "utc": {"source": leg.utc.source, "sigma_s": leg.utc.sigma_ns * 1e-9},
+        "utc": {
+            "source": leg.utc.source,
+            "sigma_s": leg.utc.sigma_ns * 1e-9,
+            "mended": list(leg.utc.mended),
+            "warnings": list(leg.utc.doubts),
+        },
         "sync": describe_sync(leg),
     }
 

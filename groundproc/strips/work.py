@@ -132,7 +132,8 @@ def _site(task: Task) -> Site:
     clock = Clock(task.week)
     near = None
     if (standard := next((c for c in clouds if not c.week_time), None)) is not None:
-        near = int(next(chunks([standard], clock)).time_ns[0])
+        # the median: a single point without a time would be of 2011
+        near = int(np.median(next(chunks([standard], clock)).time_ns))
     if near is None and task.week is None:
         try:
             route = read_route(task.trajectory, crs, near_utc_ns=None, week=None, undulation_m=task.undulation_m)

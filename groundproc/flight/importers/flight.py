@@ -18,6 +18,7 @@ from flightlog.logfile import LogWriter
 from groundproc import sensors
 from groundproc.flight.importers.joining import Event, Joiner
 from groundproc.flight.importers.sources import Capture, DataflashLog, Ports, Source, Tlog, open_mavlink
+from groundproc.flight.importers.starting import moves
 from groundproc.flight.lidar import STATED
 from groundproc.sensors.model import Lidar
 
@@ -116,8 +117,10 @@ def _write(
     attachments: dict[str, bytes],
     progress: Callable[[int], object] | None,
 ) -> Imported:
-    streams = [source.events() for source in sources if isinstance(source, (Capture, Tlog))]
-    events = heapq.merge(*streams, key=attrgetter("time_ns"))
+    timed = [source for source in sources if isinstance(source, (Capture, Tlog))]
+    for source, moved_ns in zip(timed, moves([source.start() for source in timed]), strict=True):
+        source.steady.begin(moved_ns)
+    events = heapq.merge(*(source.events() for source in timed), key=attrgetter("time_ns"))
     first = next(events, None)
     lidar_model = _lidar(sources)
     joiner = Joiner(lidar_model)

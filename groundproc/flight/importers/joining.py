@@ -19,8 +19,6 @@ from groundproc.sensors.model import Lidar
 SLOT_NS: Final = 100 * NS_PER_MS
 _LARGEST_SLOT: Final = 4096
 """Events; more in 0.1 s means stamps that stand still."""
-_JITTER_NS: Final = 50 * NS_PER_MS
-"""A smaller step back is packets out of order, a larger one is a clock that was set."""
 
 
 class Event(NamedTuple):
@@ -39,36 +37,6 @@ class LogMessage(NamedTuple):
     topic: str
     log_time_ns: int
     data: bytes
-
-
-@dataclass(slots=True)
-class Steady:
-    """Makes the times of one recording never step back.
-
-    A clock that was set back while it recorded is carried on from where it was; packets a little out of order share a time.
-    """
-
-    out_of_order: int = 0
-    steps_back: int = 0
-    stepped_ns: int = 0
-    first_ns: int | None = None
-    last_ns: int = 0
-
-    def __call__(self, time_ns: int) -> int:
-        """The time to use for something stamped `time_ns` [ns]."""
-        steady_ns = time_ns + self.stepped_ns
-        if self.first_ns is None:
-            self.first_ns = self.last_ns = steady_ns
-        if steady_ns < self.last_ns:
-            back_ns = self.last_ns - steady_ns
-            if back_ns > _JITTER_NS:
-                self.steps_back += 1
-                self.stepped_ns += back_ns
-            else:
-                self.out_of_order += 1
-            steady_ns = self.last_ns
-        self.last_ns = steady_ns
-        return steady_ns
 
 
 @dataclass(slots=True)

@@ -3,7 +3,7 @@
 import hashlib
 import io
 import mmap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -12,11 +12,13 @@ from typing import Any, BinaryIO, Final, Protocol, cast
 import numpy as np
 
 from flightlog import dataflash, hdl32e, records
-from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
 from groundproc import sensors
 from groundproc.flight.importers import pcap, tlog, udp
-from groundproc.flight.importers.joining import Event, LogMessage, Steady
+from groundproc.flight.importers.joining import Event, LogMessage
+from groundproc.flight.importers.mended import mended
+from groundproc.flight.importers.starting import Start, start_of
+from groundproc.flight.importers.steady import Steady
 from groundproc.flight.lidar import recognised
 from groundproc.sensors.model import Lidar
 
@@ -133,12 +135,24 @@ class Capture:
         return head
 
     def events(self) -> Iterator[Event]:
-        """The packets of the lidar in the order of the file, with times that never step back."""
+        """The packets of the lidar in the order in which they were sent, with times that never step back."""
+        return self.steady(self._as_stamped(chain(self._head, self._stream)))
+
+    def start(self) -> Start | None:
+        """What the first stamps say; the file is opened once more for it."""
+        return start_of(self._again)
+
+    def _again(self) -> Iterator[Event]:
+        with self.path.open("rb", buffering=1 << 20) as file:
+            packets = pcap.packets(file, pcap.CaptureCount(), str(self.path))
+            yield from self._as_stamped(udp.datagrams(packets, udp.DatagramCount()))
+
+    def _as_stamped(self, datagrams: Iterable[udp.Datagram]) -> Iterator[Event]:
         topics = {self._ports.lidar: records.LIDAR.topic, self._ports.position: records.POSITION.topic}
-        for datagram in chain(self._head, self._stream):
+        for datagram in datagrams:
             topic = topics.get(datagram.port)
             if topic is not None:
-                yield Event(self.steady(datagram.time_ns), topic, datagram.payload, datagram.sender)
+                yield Event(datagram.time_ns, topic, datagram.payload, datagram.sender)
             elif len(datagram.payload) in (hdl32e.DATA_BYTES, hdl32e.POSITION_BYTES):
                 self.other_ports[datagram.port] = len(datagram.payload)
 
@@ -159,7 +173,7 @@ class Capture:
         if self.found.untimed or self.found.borrowed_times:
             count = self.found.untimed + self.found.borrowed_times
             notes.append(f"{self.path}: {count} packets carry no time of their own")
-        return notes + _step_notes(self.path, self.steady)
+        return notes + [f"{self.path}: {said}" for said in mended(self.steady)]
 
     def close(self) -> None:
         """See Source."""
@@ -180,9 +194,16 @@ class Tlog:
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def events(self) -> Iterator[Event]:
-        """The records in the order of the file, with times that never step back."""
-        for record in tlog.records(self._data, self.count):
-            yield Event(self.steady(record.time_ns), self._topic, record.data, b"")
+        """The records in the order in which they were received, with times that never step back."""
+        return self.steady(self._as_stamped(self.count))
+
+    def start(self) -> Start | None:
+        """What the first stamps say."""
+        return start_of(lambda: self._as_stamped(tlog.TlogCount()))
+
+    def _as_stamped(self, count: tlog.TlogCount) -> Iterator[Event]:
+        for record in tlog.records(self._data, count):
+            yield Event(record.time_ns, self._topic, record.data, b"")
 
     def facts(self) -> dict[str, Any]:
         """See Source."""
@@ -196,7 +217,7 @@ class Tlog:
             notes.append(f"{self.path}: {self.count.bad_bytes} bytes belong to no good MAVLink frame")
         if self.count.cut:
             notes.append(f"{self.path}: ends within a record")
-        return notes + _step_notes(self.path, self.steady)
+        return notes + [f"{self.path}: {said}" for said in mended(self.steady)]
 
     def close(self) -> None:
         """See Source."""
@@ -273,10 +294,3 @@ def _facts(source: Source, size: int, sha256: str, counters: dict[str, Any]) -> 
         "sha256": sha256,
         "counters": {name: value for name, value in counters.items() if not name.startswith("_")},
     }
-
-
-def _step_notes(path: Path, steady: Steady) -> list[str]:
-    if not steady.steps_back:
-        return []
-    seconds = steady.stepped_ns / NS_PER_S
-    return [f"{path}: its clock was set back {steady.steps_back} times, by {seconds:.3f} s in all; times carried on"]

@@ -17,9 +17,10 @@ _STAMP_BYTES: Final = 8
 _STARTS: Final = (0xFE, 0xFD)
 _SIGNED: Final = 0x01
 _LINK_BITS: Final = 0x3
-_EARLIEST_US: Final = 946_684_800_000_000
-_LATEST_US: Final = 4_102_444_800_000_000
-"""2000-01-01 and 2100-01-01: a stamp outside is none."""
+_DATED_US: Final = 946_684_800_000_000
+"""2000-01-01."""
+_LATEST_US: Final = 1 << 53
+"""In 2255. Any stamp is one, for a computer may have had no clock; later ones are bytes of something else."""
 _AHEAD_US: Final = 3_600_000_000
 _BACK_US: Final = 10_000_000
 """Around the last stamp, where the next is looked for behind bytes that are no frame."""
@@ -149,8 +150,12 @@ def _framed_end(data: Bytes, offset: int, stamp_us: int) -> int | None:
 
 
 def _next_record(data: Bytes, offset: int, last_us: int) -> int:
-    """Offset of the next record: at a stamp near the last one, or at a good frame with any stamp; the end of the data."""
+    """Offset of the next record: at a dated stamp near the last one, or at a good frame with any stamp; the end of the data."""
     good = _next_good(data, offset)
+    if (
+        last_us < _DATED_US
+    ):  # the stamps of a computer without a clock begin with zeros, as much else does: good frames only
+        return good
     # stamps so close together share their upper bytes, but for one carry
     moments = (last_us - _BACK_US, last_us, last_us + _AHEAD_US)
     for head in {moment.to_bytes(_STAMP_BYTES, "big")[:4] for moment in moments}:
@@ -162,7 +167,7 @@ def _next_record(data: Bytes, offset: int, last_us: int) -> int:
 
 
 def _next_good(data: Bytes, offset: int) -> int:
-    """Offset of the next stamp, of any time in this century, that a good frame follows; the end where there is none."""
+    """Offset of the next stamp, of any time, that a good frame follows; the end where there is none."""
     start = offset + _STAMP_BYTES
     while True:
         places = [place for place in (data.find(b"\xfe", start), data.find(b"\xfd", start)) if place >= 0]
@@ -175,8 +180,8 @@ def _next_good(data: Bytes, offset: int) -> int:
 
 
 def _is_stamped_frame(data: Bytes, offset: int) -> bool:
-    """Whether a time of this century and a good frame stand at `offset`."""
-    if not _EARLIEST_US <= _stamp(data, offset) < _LATEST_US:
+    """Whether a time and a good frame stand at `offset`."""
+    if offset < 0 or _stamp(data, offset) >= _LATEST_US:
         return False
     start = offset + _STAMP_BYTES
     end = _frame_end(data, start)

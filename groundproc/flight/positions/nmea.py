@@ -18,6 +18,7 @@ import numpy.typing as npt
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from flightlog.nmea import checksum
+from groundproc.flight.positions.scales import in_era, stray
 from groundproc.flight.positions.solution import ANTENNA, MSL, Quality, Solution, tidied
 
 Array = npt.NDArray[np.float64]
@@ -242,7 +243,7 @@ _PARSERS: Final[dict[str, Callable[[_Reader, list[str]], None]]] = {
 
 def _times_ns(epochs: list[_Epoch], near_utc_ns: int | None, path: Path) -> list[int]:
     """Unix times of epochs: by their own date, else the day nearest to the epoch before, else to the one after."""
-    known = [e.date_ns + e.of_day_ns if e.date_ns is not None else None for e in epochs]
+    known = _known_ns(epochs)
     first = next((t for t in known if t is not None), near_utc_ns)
     if first is None:
         raise LogError(f"{path}: no date in it (RMC or ZDA with a right checksum); a log of the same flight gives one")
@@ -251,6 +252,16 @@ def _times_ns(epochs: list[_Epoch], near_utc_ns: int | None, path: Path) -> list
         last = _nearest(epoch.of_day_ns, last) if time_ns is None else time_ns
         times.append(last)
     return times
+
+
+def _known_ns(epochs: list[_Epoch]) -> list[int | None]:
+    """Unix times of the epochs that have a date; one of another era is mended, and one that none of the others bears out is none."""
+    rows = [i for i, epoch in enumerate(epochs) if epoch.date_ns is not None]
+    time_ns, _ = in_era(np.array([(e.date_ns or 0) + e.of_day_ns for e in epochs if e.date_ns is not None], np.int64))
+    known: list[int | None] = [None] * len(epochs)
+    for i, time, wild in zip(rows, time_ns.tolist(), stray(time_ns).tolist(), strict=True):
+        known[i] = None if wild else time
+    return known
 
 
 def _nearest(of_day_ns: int, near_ns: int) -> int:

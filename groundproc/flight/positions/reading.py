@@ -9,7 +9,7 @@ from groundproc.flight.positions.poses import looks_like_poses, read_poses
 from groundproc.flight.positions.rinex import is_raw_observations
 from groundproc.flight.positions.rtklib import looks_like_pos, read_pos
 from groundproc.flight.positions.sbet import looks_like_accuracy, looks_like_sbet, read_sbet
-from groundproc.flight.positions.solution import ELLIPSOID, Solution
+from groundproc.flight.positions.solution import ELLIPSOID, Solution, dated
 
 _HEAD: Final = 1 << 16
 
@@ -29,7 +29,8 @@ def read_solution(
     ----------
     path : Path
     near_utc_ns : int, optional
-        A time of the flight [ns], such as the start of its log: it gives an SBET its week, and NMEA without date its day.
+        A time of the flight [ns], such as the start of its log: it gives an SBET its week, NMEA without date its day, and dates
+        that are whole eras of 1024 weeks off theirs.
     week, accuracy, utc_seconds
         Of an SBET; see `read_sbet`.
     poses_height : str
@@ -48,11 +49,11 @@ def read_solution(
         raise LogError(f"{path}: cannot be read ({error.strerror})") from None
     text = head.decode("utf-8", errors="replace") if b"\x00" not in head else ""
     if looks_like_pos(text):
-        return read_pos(path)
+        return dated(read_pos(path), near_utc_ns)
     if looks_like_poses(text):
-        return read_poses(path, height_reference=poses_height)
+        return dated(read_poses(path, height_reference=poses_height), near_utc_ns)
     if looks_like_nmea(head):
-        return read_nmea(path, near_utc_ns=near_utc_ns)
+        return dated(read_nmea(path, near_utc_ns=near_utc_ns), near_utc_ns)
     if looks_like_sbet(head, size):
         return read_sbet(path, near_utc_ns=near_utc_ns, week=week, accuracy=accuracy, utc_seconds=utc_seconds)
     raise LogError(f"{path}: {_what_else(head, size)}, expected an RTKLIB .pos, an SBET, NMEA, or a table with utc_ns")

@@ -11,10 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.clock import utc_to_gps_ns
+from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError, UsageError
 from groundproc.flight.positions.ellipsoid import ecef_from_geodetic, mat_ecef_enu
-from groundproc.flight.positions.scales import EPOCH_NS, WEEK_NS, first_of_each, utc_from_gps_calendar
+from groundproc.flight.positions.scales import (
+    EPOCH_NS,
+    WEEK_NS,
+    WEEK_S,
+    calendar_of_week,
+    first_of_each,
+    gps_calendar_from_utc,
+    stray,
+    utc_from_gps_calendar,
+)
 from groundproc.flight.positions.solution import ELLIPSOID, INS, Quality, Solution, diagonal_covariance, tidied
 
 Array = npt.NDArray[np.float64]
@@ -28,7 +37,6 @@ _ACCURACY: Final = (
 )  # fmt: skip
 RECORD: Final = np.dtype([(name, "<f8") for name in _NAMES])
 ACCURACY_RECORD: Final = np.dtype([(name, "<f8") for name in _ACCURACY])
-_WEEK_S: Final = 604_800
 _MINUTE_RAD: Final = np.pi / 180 / 60
 _LARGEST: Final = {
     "time": 1e11, "latitude": np.pi / 2, "longitude": 2 * np.pi, "altitude": 1e5, "x_velocity": 1e4, "y_velocity": 1e4,
@@ -114,12 +122,13 @@ def read_sbet(
     records = whole[_sound(whole)]
     if not len(records):
         raise LogError(f"{path}: none of its {len(whole)} records holds a place, a velocity and an attitude")
-    time_ns = _utc_ns(records["time"], path, near_utc_ns, week, utc_seconds)
+    records, calendar_ns = _of_weeks(records, path, near_utc_ns, week)
+    time_ns = calendar_ns if utc_seconds else utc_from_gps_calendar(calendar_ns)
     speed, sign, note = _velocity(records)
     heading = records["platform_heading"] - sign * records["wander_angle"]
     quat = frames.quat_from_mat(frames.mat_local_ins(heading, records["pitch"], records["roll"]))
     accuracy = accuracy or _beside(path)
-    position, velocity, attitude = _covariances(records["time"], accuracy, path)
+    position, velocity, attitude = _covariances(calendar_ns, accuracy, path)
     return tidied(
         Solution(
             source=path.name,
@@ -164,23 +173,25 @@ def _read(path: Path, record: np.dtype[np.void], what: str) -> npt.NDArray[np.vo
     return records
 
 
-def _utc_ns(
-    time_s: Array, path: Path, near_utc_ns: int | None, week: int | None, utc_seconds: bool
-) -> npt.NDArray[np.int64]:
-    """Unix times of seconds of the week; they run on over the week's end, or start again there."""
-    if time_s.min() < 0 or time_s.max() >= 2 * _WEEK_S:
+def _of_weeks(
+    records: npt.NDArray[np.void], path: Path, near_utc_ns: int | None, week: int | None
+) -> tuple[npt.NDArray[np.void], npt.NDArray[np.int64]]:
+    """Records whose times are seconds of the week, and those times written as a calendar [ns], shape (n,)."""
+    time_s = records["time"]
+    can_be = (time_s >= 0) & (time_s < 2 * WEEK_S)
+    if can_be.mean() <= _MOST:
         raise LogError(
-            f"{path}: times of {time_s.min():.1f} to {time_s.max():.1f} s found, expected seconds of the GPS week, 0 to {_WEEK_S}"
+            f"{path}: times of {time_s.min():.1f} to {time_s.max():.1f} s found, expected seconds of the GPS week, 0 to {WEEK_S}"
         )
-    turned_over = np.concatenate([[0], np.cumsum(np.diff(time_s) < -_WEEK_S / 2)])
-    of_week_ns = np.rint(time_s * 1e9).astype(np.int64) + turned_over * WEEK_NS
-    if week is None:
-        if near_utc_ns is None:
-            raise UsageError(f"{path}: an SBET does not say its GPS week; give the week, or a log of the same flight")
-        near_ns = utc_to_gps_ns(near_utc_ns)
-        week = round((near_ns - int(of_week_ns[len(of_week_ns) // 2])) / WEEK_NS)
-    calendar_ns = of_week_ns + week * WEEK_NS + EPOCH_NS
-    return calendar_ns if utc_seconds else utc_from_gps_calendar(calendar_ns)
+    if week is None and near_utc_ns is None:
+        raise UsageError(f"{path}: an SBET does not say its GPS week; give the week, or a log of the same flight")
+    records = records[can_be]
+    if week is not None:  # it goes first: it is that of the file, and a log may be of another flight
+        return records, calendar_of_week(records["time"], week=week)
+    assert near_utc_ns is not None
+    calendar_ns = calendar_of_week(records["time"], week=0)
+    near_ns = int(gps_calendar_from_utc(np.array([near_utc_ns]))[0])
+    return records, calendar_ns + round((near_ns - int(np.median(calendar_ns))) / WEEK_NS) * WEEK_NS
 
 
 def _beside(path: Path) -> Path | None:
@@ -191,22 +202,25 @@ def _beside(path: Path) -> Path | None:
     return other if other.is_file() else None
 
 
-def _covariances(time_s: Array, accuracy: Path | None, path: Path) -> tuple[Array, Array, Array]:
+def _covariances(calendar_ns: npt.NDArray[np.int64], accuracy: Path | None, path: Path) -> tuple[Array, Array, Array]:
     """Of position, velocity (east, north, up) and attitude (roll, pitch, heading), shape (n, 3, 3), at times (n,)."""
     if accuracy is None:
-        unknown = np.full((len(time_s), 3, 3), np.nan)
+        unknown = np.full((len(calendar_ns), 3, 3), np.nan)
         return unknown, unknown, unknown
     records = _read(accuracy, ACCURACY_RECORD, "an SBET's accuracy file (10 doubles a record)")
-    if not (np.isfinite(records["time"]).all() and (np.diff(records["time"]) > 0).all()):
-        raise LogError(f"{accuracy}: its times do not increase; is it an SBET's accuracy file?")
-    start, end = float(records["time"][0]), float(records["time"][-1])
-    if not (start - 1.0 <= time_s[0] and time_s[-1] <= end + 1.0):
+    kept, middle_ns = ~stray(calendar_ns), int(np.median(calendar_ns))
+    records, stated_ns = _rising_records(records, accuracy, middle_ns)
+    start, end = int(stated_ns[0]), int(stated_ns[-1])
+    first, last = int(calendar_ns[kept].min()), int(calendar_ns[kept].max())
+    if not (start - NS_PER_S <= first and last <= end + NS_PER_S):
         raise LogError(
-            f"{accuracy}: covers {start:.1f} to {end:.1f} s of the week, but {path.name} has {time_s[0]:.1f} to {time_s[-1]:.1f}"
+            f"{accuracy}: covers {_of_week(start)} to {_of_week(end)} s of the week, but {path.name} has {_of_week(first)} to "
+            f"{_of_week(last)}"
         )
+    time_s, stated_s = (calendar_ns - start) * 1e-9, (stated_ns - start) * 1e-9
 
     def at(*names: str) -> Array:
-        return np.stack([np.interp(time_s, records["time"], records[name]) for name in names], axis=-1)
+        return np.stack([np.interp(time_s, stated_s, records[name]) for name in names], axis=-1)
 
     angle = at("roll", "pitch", "heading") * _MINUTE_RAD
     return (
@@ -214,6 +228,26 @@ def _covariances(time_s: Array, accuracy: Path | None, path: Path) -> tuple[Arra
         diagonal_covariance(at("east_velocity", "north_velocity", "down_velocity")),
         diagonal_covariance(angle),
     )
+
+
+def _rising_records(
+    records: npt.NDArray[np.void], place: Path, near_ns: int
+) -> tuple[npt.NDArray[np.void], npt.NDArray[np.int64]]:
+    """Records of an accuracy file whose times increase over the week's end, and those times; single wild ones are passed over."""
+    time_s = records["time"]
+    with np.errstate(invalid="ignore"):
+        records = records[(time_s >= 0) & (time_s < 2 * WEEK_S)]
+    stated_ns = calendar_of_week(records["time"], near_ns=near_ns)
+    near = ~stray(stated_ns)
+    rises = near.copy()
+    rises[1:] &= stated_ns[1:] > np.maximum.accumulate(np.where(near, stated_ns, 0))[:-1]
+    if rises.sum() <= _MOST * len(time_s):
+        raise LogError(f"{place}: its times do not increase; is it an SBET's accuracy file?")
+    return records[rises], stated_ns[rises]
+
+
+def _of_week(calendar_ns: int) -> str:
+    return f"{(calendar_ns - EPOCH_NS) % WEEK_NS * 1e-9:.1f}"
 
 
 def _velocity(records: npt.NDArray[np.void]) -> tuple[Array | None, float, str]:

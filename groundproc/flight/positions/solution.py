@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from flightlog.clock import utc_text
 from flightlog.errors import LogError
+from groundproc.flight.positions.scales import in_era, stray
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -157,8 +158,8 @@ _PER_ROW: Final = (
 def tidied(solution: Solution, place: str) -> Solution:
     """Rows that can be, in time order; what cannot be is counted.
 
-    Left out are `without_fix` (quality 0), `impossible` (no number, no place on Earth, outside -1 to 20 km of height) and
-    `repeated` (a time that an earlier row has already).
+    Left out are `without_fix` (quality 0), `impossible` (no number, no place on Earth, outside -1 to 20 km of height), `stray_time`
+    (a few of another day than the rest) and `repeated` (a time that an earlier row has already).
 
     Raises
     ------
@@ -177,6 +178,9 @@ def tidied(solution: Solution, place: str) -> Solution:
     _count(left_out, "without_fix", int((~fixed).sum()))
     _count(left_out, "impossible", int((fixed & ~possible).sum()))
     kept = solution.rows(fixed & possible)
+    apart = stray(kept.time_ns)
+    _count(left_out, "stray_time", int(apart.sum()))
+    kept = kept.rows(~apart)
     kept = kept.rows(np.argsort(kept.time_ns, kind="stable"))
     if len(kept):
         new = np.concatenate([[True], np.diff(kept.time_ns) > 0])
@@ -186,6 +190,26 @@ def tidied(solution: Solution, place: str) -> Solution:
         reasons = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in left_out.items()) or "it has no rows"
         raise LogError(f"{place}: holds no position ({reasons})")
     return dataclasses.replace(kept, left_out=left_out)
+
+
+def dated(solution: Solution, near_utc_ns: int | None) -> Solution:
+    """A solution without rollovers of the GPS week: dates that are whole eras of 1024 weeks from the flight's are mended, and that is said.
+
+    Parameters
+    ----------
+    solution : Solution
+    near_utc_ns : int, optional
+        A time of the flight [ns]; without it nothing is changed.
+    """
+    if near_utc_ns is None:
+        return solution
+    time_ns, wrong = in_era(solution.time_ns, near_utc_ns)
+    if not wrong:
+        return solution
+    stated = utc_text(int(solution.time_ns[0]))
+    note = f"{wrong} of its dates are whole eras of 1024 GPS weeks off, from {stated} on; mended to {utc_text(int(time_ns[0]))}"
+    order = np.argsort(time_ns, kind="stable")
+    return dataclasses.replace(solution, time_ns=time_ns, notes=(*solution.notes, note)).rows(order)
 
 
 def _count(left_out: dict[str, int], reason: str, number: int) -> None:

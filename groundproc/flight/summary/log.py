@@ -12,6 +12,7 @@ from flightlog.errors import LogError, WrongSensorError
 from flightlog.logfile import LogReader, Message
 from flightlog.mavlink import FrameParser
 from groundproc import sensors
+from groundproc.flight import claims
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import BatchJoiner, DeviceClock, PositionBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
@@ -137,11 +138,35 @@ class LogSummary:
                 link: telemetry.result(parser.bad_bytes, parser.unknown)
                 for link, (parser, telemetry) in sorted(self.links.items())
             },
+            "utc": self._utc(),
             "gaps": self.gaps,
             "gap_count": self.gap_count,
             "messages_backwards": self.backwards,
             "messages_damaged": self.damaged,
             "host_clock_steps": self.clock_steps,
+        }
+
+    def _claims(self) -> tuple[dict[str, int], bool]:
+        """What each source says that UTC was at the first SYSTEM_TIME, else at the lidar's first fix; and whether the lidar's is exact."""
+        pilot = next((each for _, each in self.links.values() if each.first_utc_ns is not None), None)
+        fix = self.position.first_utc_ns()
+        host_ns = pilot.first_utc_received_ns if pilot is not None else self.position.first_fix_received_ns
+        found = {claims.HOST: host_ns} if host_ns else {}
+        if pilot is not None and pilot.first_utc_ns is not None:
+            found[claims.SYSTEM_TIME] = pilot.first_utc_ns
+        if fix is not None:
+            found[claims.GPRMC] = fix[0] + host_ns - self.position.first_fix_received_ns
+        return found, fix is not None and fix[1]
+
+    def _utc(self) -> dict[str, Any]:
+        """Absolute times held against each other; those mended."""
+        claimed, exact = self._claims()
+        held = claims.settled(claimed, exact=exact)
+        return {
+            "claims": {name: clock.utc_text(utc_ns) for name, utc_ns in claimed.items()},
+            "right": {name: clock.utc_text(claimed[name] + add_ns) for name, add_ns in held.add_ns.items()},
+            "mended": list(held.mended),
+            "doubts": list(held.doubts),
         }
 
     def _seen(self, *topics: str) -> bool:

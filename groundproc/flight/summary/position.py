@@ -14,6 +14,7 @@ _HOUR_NS: Final = 3600 * NS_PER_S
 _LONGEST_LAG_NS: Final = 3 * NS_PER_S
 """A sentence appears in the packets some time after its second began, 0.85 s in a recording [measured]."""
 _MOST_SENTENCES: Final = 100_000
+ALIGNED: Final = "aligned to UTC"
 
 
 @dataclass(slots=True)
@@ -30,6 +31,8 @@ class PositionSummary:
     last_ns: int = 0
     lags_ns: list[int] = field(default_factory=list)
     first_fix: nmea.Rmc | None = None
+    first_fix_received_ns: int = 0
+    first_fix_device_ns: int = 0
     last_fix: nmea.Rmc | None = None
     _text: str = ""
 
@@ -57,16 +60,28 @@ class PositionSummary:
             return
         self.valid += rmc.valid
         if rmc.valid:
-            self.first_fix = self.first_fix or rmc
+            if self.first_fix is None:
+                self.first_fix, self.first_fix_received_ns = rmc, sentence.receive_time_ns
+                self.first_fix_device_ns = sentence.device_time_ns
             self.last_fix = rmc
         if whole and len(self.lags_ns) < _MOST_SENTENCES:
-            lag_ns = (sentence.device_time_ns - rmc.utc_ns + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2
-            self.lags_ns.append(lag_ns)
+            self.lags_ns.append(_lag_ns(sentence.device_time_ns, rmc))
+
+    def first_utc_ns(self) -> tuple[int, bool] | None:
+        """UTC of the first fix when it was received, and whether the lidar's clock tells it exactly; None without a fix."""
+        if self.first_fix is None:
+            return None
+        exact = self._clock_state(self.lag_ns()) == ALIGNED
+        return self.first_fix.utc_ns + (_lag_ns(self.first_fix_device_ns, self.first_fix) if exact else 0), exact
+
+    def lag_ns(self) -> int | None:
+        """How late sentences appear after their second, by the lidar's clock; None where that is not known."""
+        return int(np.median(self.lags_ns)) if self.lags_ns else None
 
     def result(self) -> dict[str, Any]:
         """The figures; see `swath info --json`."""
         duration_s = (self.last_ns - (self.first_ns or 0)) / NS_PER_S
-        lag_ns = int(np.median(self.lags_ns)) if self.lags_ns else None
+        lag_ns = self.lag_ns()
         return {
             "packets": self.packets,
             "rate_hz": round((self.packets - 1) / duration_s, 2) if duration_s > 0 else None,
@@ -86,10 +101,15 @@ class PositionSummary:
     def _clock_state(self, lag_ns: int | None) -> str:
         """What the lidar's clock counts: the PPS byte alone proves nothing, firmware of 2012 leaves it 0."""
         if lag_ns is not None and 0 <= lag_ns < _LONGEST_LAG_NS:
-            return "aligned to UTC"
+            return ALIGNED
         if self.pps.get(PpsState.LOCKED, 0) > self.packets / 2:
             return "locked to PPS"
         return "free running" if self.packets else "unknown"
+
+
+def _lag_ns(device_ns: int, rmc: nmea.Rmc) -> int:
+    """Lidar time past the hour less that which a sentence states."""
+    return (device_ns - rmc.utc_ns + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2
 
 
 def _pps_name(state: int) -> str:

@@ -7,6 +7,7 @@ from typing import Any, Final
 from flightlog import clock
 from flightlog.constants import NS_PER_S
 from flightlog.mavlink import AUTOPILOT_INVALID, Frame, message_id, payload_dtype
+from groundproc.flight.claims import can_be
 
 _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
@@ -56,6 +57,10 @@ class TelemetrySummary:
     frames: int = 0
     nodes: dict[tuple[int, int], _Node] = field(default_factory=dict)
     first_utc_ns: int | None = None
+    """The first UTC that the autopilot states and that can be."""
+    first_utc_received_ns: int = 0
+    impossible_utc: int = 0
+    """SYSTEM_TIME messages with a date that cannot be; one without a fix has none."""
     fix_type: int | None = None
     satellites: int | None = None
 
@@ -79,8 +84,15 @@ class TelemetrySummary:
             self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
         if frame.message_id in _BOOT_TIMED:
             _boot(node, frame.time_ns, _value(frame, "time_boot_ms"))
-        if frame.message_id == _SYSTEM_TIME and self.first_utc_ns is None:
-            self.first_utc_ns = _value(frame, "time_unix_usec") * 1000 or None
+        if frame.message_id == _SYSTEM_TIME:
+            self._system_time(frame.time_ns, _value(frame, "time_unix_usec") * 1000)
+
+    def _system_time(self, received_ns: int, utc_ns: int) -> None:
+        if can_be(utc_ns):
+            if self.first_utc_ns is None:
+                self.first_utc_ns, self.first_utc_received_ns = utc_ns, received_ns
+        else:
+            self.impossible_utc += utc_ns >= clock.PLAUSIBLE_UTC_NS[1]
 
     def result(self, bad_bytes: int, unknown: int) -> dict[str, Any]:
         """The figures; see `swath info --json`."""
@@ -95,6 +107,7 @@ class TelemetrySummary:
             "gps_fix_type": self.fix_type,
             "gps_satellites": self.satellites,
             "first_system_time_utc": clock.utc_text(self.first_utc_ns) if self.first_utc_ns else None,
+            "impossible_system_times": self.impossible_utc,
             "messages": [
                 _kind(key, kind)
                 for key, node in sorted(self.nodes.items())

@@ -14,6 +14,8 @@ def as_text(summary: dict[str, Any]) -> str:
         lines += _section("position packets", _position(summary["position"]))
     for link, mavlink in summary["mavlink"].items():
         lines += _section(f"mavlink {link}", _mavlink(mavlink))
+    if summary["utc"]["claims"]:
+        lines += _section("UTC at one instant", _utc(summary["utc"]))
     if summary["gap_count"]:
         lines += _section(f"gaps of more than a second: {summary['gap_count']}", _gaps(summary))
     return "\n".join(lines)
@@ -105,10 +107,19 @@ def _mavlink(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if mavlink["gps_fix_type"] is not None:
         yield "GPS", f"best fix type {mavlink['gps_fix_type']}, {mavlink['gps_satellites']} satellites at most"
     if mavlink["first_system_time_utc"]:
-        yield "autopilot's UTC", f"known, first {mavlink['first_system_time_utc']}"
+        yield "autopilot's UTC", f"stated, first {mavlink['first_system_time_utc']}"
+    if mavlink["impossible_system_times"]:
+        yield "", f"{mavlink['impossible_system_times']} messages state a date that cannot be; not used"
     for kind in mavlink["messages"]:
         rate = "" if kind["rate_hz"] is None else f"{kind['rate_hz']:8.2f} a second"
         yield f"{kind['system']}/{kind['component']} {kind['name']}".ljust(38), f"{kind['count']:8d} {rate}"
+
+
+def _utc(utc: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, stated in utc["claims"].items():
+        yield name, f"{stated}, mended to {right}" if (right := utc["right"].get(name, stated)) != stated else stated
+    for sentence in (*utc["mended"], *utc["doubts"]):
+        yield "", sentence
 
 
 def _gaps(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -244,7 +244,7 @@ def test_the_keys_of_the_json_are_these(monterey_log: Path) -> None:
     assert sorted(summary) == [
         "attachments", "bytes", "damage", "duration_s", "end_utc", "file", "format_version", "gap_count", "gaps",
         "host_clock_steps", "lidar", "mavlink", "messages_backwards", "messages_damaged", "position", "session", "start_utc",
-        "topics", "truncated",
+        "topics", "truncated", "utc",
     ]  # fmt: skip
     assert sorted(summary["lidar"]) == [
         "account", "azimuth_coverage_deg", "clock", "lost_packets", "missing_outside_sensor_fov",

@@ -71,6 +71,35 @@ def test_a_short_recording_tells_no_drift_and_a_set_clock_is_none() -> None:
     assert line.host_ns(int(device[0])) == pytest.approx(HOST_NS, abs=1 * MS)
 
 
+@pytest.mark.parametrize(
+    ("times", "seconds", "latency_s"), [(4.3, 40, 0.02), (0.23, 40, 0.02), (1.05, 30, 0.02), (4.3, 300, 0.5)]
+)
+def test_a_clock_of_another_rate_is_told(times: float, seconds: float, latency_s: float) -> None:
+    """A simulator that runs faster than time, as one recorded log does: 4.3 s of the autopilot's clock in a second."""
+    device, host = received(seconds, 25, 0.0, latency_s, 2)
+    device = device[0] + np.rint((device - device[0]) * times).astype(np.int64)
+    # 4 times the latency that a hundredth of the messages exceed, over the span
+    assert host_line(device, host).rate == pytest.approx(times, rel=0.02 + 20 * latency_s / seconds)
+
+
+@pytest.mark.parametrize(("seconds", "latency_s"), [(3, 2.0), (20, 2.0), (300, 2.0), (300, 0.006)])
+def test_late_messages_and_crystals_are_no_other_rate(seconds: float, latency_s: float) -> None:
+    for seed in range(10):
+        for drift_ppm in (-200.0, 200.0):
+            device, host = received(seconds, 25, drift_ppm, latency_s, seed)
+            assert host_line(device, host).rate == 1.0
+
+
+def test_sentences_of_another_era_and_single_wild_ones_tell_the_hour_all_the_same() -> None:
+    past_ns = UTC_NS % (3600 * S)
+    era_ns = 1024 * 7 * 86_400 * S
+    fixes = [(past_ns + i * S + 300 * MS, fix(UTC_NS + i * S - (era_ns if i < 20 else 0))) for i in range(60)]
+    fixes[30] = (fixes[30][0], fix(UTC_NS + 1234 * S))
+    tie = lidar_utc(fixes)
+    assert tie is not None
+    assert tie.offset_ns == UTC_NS - past_ns
+
+
 def test_messages_out_of_order_make_no_difference() -> None:
     device, host = received(100, 25, 30.0, 0.05, 3)
     order = np.random.default_rng(1).permutation(len(device))

@@ -9,6 +9,7 @@ import pytest
 
 from flightlog.errors import LogError
 from groundproc.flight.positions.nmea import ASSUMED_M, read_nmea
+from groundproc.flight.positions.reading import read_solution
 from groundproc.flight.positions.solution import Quality
 
 
@@ -78,6 +79,31 @@ def test_midnight_is_passed_with_and_without_a_date_of_its_own(write: Callable[.
     ]
     after = line("GNZDA,000000.00,01,01,2024,00,00")
     assert read_nmea(write(gga("235959.80"), after, gga("000000.00"))).time_ns[0] == utc("2023-12-31T23:59:59.8")
+
+
+def test_dates_an_era_behind_are_brought_to_the_flight_and_it_is_said(write: Callable[..., Path]) -> None:
+    """1024 weeks before 2024-02-07 is 2004-06-23."""
+    behind = line("GNRMC,115942.20,A,5823.4,N,01537.2,E,,,230604,,,R,V")
+    right = line("GNRMC,115942.40,A,5823.4,N,01537.2,E,,,070224,,,R,V")
+    path = write(behind, gga("115942.20"))
+    found = read_solution(path, near_utc_ns=utc("2024-02-07T12:30:00"))
+    assert found.time_ns[0] == utc("2024-02-07T11:59:42.2")
+    assert "1024 GPS weeks" in found.notes[0]
+    # without a flight to hold it against a date stands; two dates in one file are held against each other
+    assert read_solution(path).time_ns[0] == utc("2004-06-23T11:59:42.2")
+    found = read_nmea(write(behind, gga("115942.20"), right, gga("115942.40")))
+    assert found.time_ns.tolist() == [utc("2024-02-07T11:59:42.2"), utc("2024-02-07T11:59:42.4")]
+
+
+def test_a_single_wild_date_is_none(write: Callable[..., Path]) -> None:
+    wild = line("GNRMC,115943.20,A,5823.4,N,01537.2,E,,,010199,,,R,V")
+    rows = [
+        each
+        for i in range(4)
+        for each in (line(f"GNRMC,11594{i}.00,A,5823.4,N,01537.2,E,,,070224,,,R,V"), gga(f"11594{i}.00"))
+    ]
+    found = read_nmea(write(*rows, wild, gga("115943.20"), gga("115943.40")))
+    assert found.time_ns[-2:].tolist() == [utc("2024-02-07T11:59:43.2"), utc("2024-02-07T11:59:43.4")]
 
 
 def test_without_a_date_the_flight_gives_it(write: Callable[..., Path]) -> None:

@@ -117,6 +117,29 @@ def test_the_end_of_the_week_is_passed(write: Callable[..., Path]) -> None:
     assert found.time_ns[200] == gps_week_to_utc_ns(WEEK + 1, 0)
 
 
+def test_sbet_and_accuracy_file_start_again_together_at_the_weeks_end(write: Callable[..., Path]) -> None:
+    rows = records(start_s=604_799.0)
+    path = write(rows)
+    times = np.concatenate([[604_798.5], np.arange(604_799.0, 604_801.5, 0.1)]) % 604_800
+    write([(t, *(0.01 * (1 + i) for _ in range(6)), 0.5, 0.6, 2.0) for i, t in enumerate(times)], "smrmsg_1.out")
+    for near in (None, gps_week_to_utc_ns(WEEK + 1, 0) - 10**12, gps_week_to_utc_ns(WEEK + 1, 0) + 10**12):
+        found = read_sbet(path, week=WEEK if near is None else None, near_utc_ns=near)
+        assert found.time_ns[200] == gps_week_to_utc_ns(WEEK + 1, 0)
+        # sigma grows by 0.01 m each 0.1 s, through the end of the week
+        np.testing.assert_allclose(np.diff(found.sigma_m[:, 0]), 0.01 * 0.05, rtol=1e-6)
+
+
+def test_a_record_without_time_moves_no_other(write: Callable[..., Path]) -> None:
+    rows = records()
+    rows[7] = (0.0, *rows[7][1:])
+    rows[9] = (-1.0, *rows[9][1:])
+    truth = gps_week_to_utc_ns(WEEK, 302_400_000)
+    for given in ({"week": WEEK}, {"near_utc_ns": truth + 10**12}):
+        found = read_sbet(write(rows), **given)
+        assert (found.time_ns[0], len(found)) == (truth, 398)
+        assert found.left_out["stray_time"] == 1
+
+
 def test_the_accuracy_file_beside_it_states_the_sigmas(write: Callable[..., Path]) -> None:
     rows = records()
     path = write(rows)
