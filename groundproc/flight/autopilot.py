@@ -4,7 +4,8 @@ All times here are nanoseconds since boot. A reboot inside a file begins a new s
 """
 
 import itertools
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,6 +16,7 @@ from flightlog import frames, mavlink
 from flightlog.constants import NS_PER_MS, NS_PER_US
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame
+from flightlog.vehicles import Address, Sender, Vehicles
 from groundproc.flight.sync import GyroTrack
 
 Array = npt.NDArray[np.float64]
@@ -109,8 +111,31 @@ class Boot:
         return tracks
 
 
-def boots(all_frames: Sequence[Frame]) -> list[Boot]:
-    """Sort a link's frames into boots of its autopilot.
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """One autopilot of those on a link.
+
+    Attributes
+    ----------
+    addresses : tuple of (int, int)
+        System and component, in the order in which it used them: an id may be changed in flight.
+    boots : list of Boot
+    """
+
+    addresses: tuple[Address, ...]
+    boots: list[Boot]
+
+    @property
+    def name(self) -> str:
+        """Its addresses, such as 1/1."""
+        return ", then ".join(f"{system}/{component}" for system, component in self.addresses)
+
+
+def vehicles(all_frames: Sequence[Frame]) -> list[Vehicle]:
+    """Sort a link's frames into vehicles and their boots, first the one that `flightlog.vehicles` elects for most of the time.
+
+    An address that was never heard together with another, and only after it, is the same vehicle under a new id, until the gyros
+    contradict (`vehicle.choose`).
 
     Parameters
     ----------
@@ -120,14 +145,43 @@ def boots(all_frames: Sequence[Frame]) -> list[Boot]:
     Raises
     ------
     LogError
-        No autopilot sent a heartbeat.
+        No autopilot was heard.
     """
-    address = _autopilot(all_frames)
-    mine = [f for f in all_frames if f.known and (f.system, f.component) == address]
+    heard, elected = Vehicles(), Counter[Address]()
+    for frame in all_frames:
+        heard.hear(frame)
+        if heard.autopilot is not None:
+            elected[heard.autopilot] += 1
+    chains = _chains({address: sender for address, sender in heard.senders.items() if sender.is_vehicle})
+    if not chains:
+        raise LogError("MAVLink: no heartbeat of an autopilot and no attitudes in the log, expected one a second")
+    chains.sort(key=lambda chain: -sum(elected[address] for address in chain))
+    return [Vehicle(tuple(chain), _boots(all_frames, chain)) for chain in chains]
+
+
+def boots(all_frames: Sequence[Frame]) -> list[Boot]:
+    """The boots of the elected vehicle; see `vehicles`."""
+    return vehicles(all_frames)[0].boots
+
+
+def _chains(senders: Mapping[Address, Sender]) -> list[list[Address]]:
+    """Addresses that follow each other in time, without ever being heard together."""
+    chains: list[list[Address]] = []
+    for address in sorted(senders, key=lambda each: senders[each].first_ns):
+        before = [chain for chain in chains if senders[chain[-1]].newest_ns < senders[address].first_ns]
+        if before:
+            max(before, key=lambda chain: senders[chain[-1]].newest_ns).append(address)
+        else:
+            chains.append([address])
+    return chains
+
+
+def _boots(all_frames: Sequence[Frame], addresses: Collection[Address]) -> list[Boot]:
+    mine = [f for f in all_frames if f.known and (f.system, f.component) in addresses]
     clock_ms = _running_clock_ms(mine)
     starts = [0, *_reboots(mine, clock_ms), len(mine)]
     return [
-        _boot(number, address, mine[a:b], clock_ms[a:b])
+        _boot(number, (mine[a].system, mine[a].component), mine[a:b], clock_ms[a:b])
         for number, (a, b) in enumerate(itertools.pairwise(starts))
         if b > a
     ]
@@ -145,18 +199,6 @@ def _reboots(mine: Sequence[Frame], clock_ms: npt.NDArray[np.int64]) -> list[int
     counted_ms = np.diff(clock_ms[own])
     reboot = (counted_ms < -REBOOT_MS) | (passed_ms - counted_ms > LOST_MS)
     return [int(i) for i in own[1:][reboot]]
-
-
-def _autopilot(all_frames: Sequence[Frame]) -> tuple[int, int]:
-    """The autopilot that says most, should there be several."""
-    addresses = mavlink.autopilots(all_frames)
-    if not addresses:
-        raise LogError("MAVLink: no heartbeat of an autopilot in the log, expected one a second")
-    counts = dict.fromkeys(addresses, 0)
-    for frame in all_frames:
-        if (frame.system, frame.component) in counts:
-            counts[(frame.system, frame.component)] += 1
-    return max(counts, key=lambda address: counts[address])
 
 
 def _running_clock_ms(mine: Sequence[Frame]) -> npt.NDArray[np.int64]:

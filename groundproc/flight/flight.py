@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +11,13 @@ from flightlog import nmea, records
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame, FrameParser
-from groundproc.flight import autopilot, load, timebase
+from groundproc.flight import autopilot, load, timebase, vehicle
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import JUMP_NS, PositionSamples
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
+from groundproc.flight.vehicle import Choice
 from groundproc.sensors.model import Lidar
 
 Progress = Callable[[int], None]
@@ -32,6 +33,8 @@ class Flight:
     runs : list of LidarRun
     lidar : Lidar
         That it was recorded with.
+    choice : Choice
+        Whose boots these are, of the vehicles on the link.
     frames, bad_bytes, unknown : int
         MAVLink: frames read, bytes that belong to none, frames of messages outside the dialect.
     """
@@ -39,10 +42,10 @@ class Flight:
     boots: list[Boot]
     runs: list[LidarRun]
     lidar: Lidar
+    choice: Choice
     frames: int = 0
     bad_bytes: int = 0
     unknown: int = 0
-    notes: list[str] = field(default_factory=list)
 
 
 def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | None = None) -> Flight:
@@ -64,11 +67,12 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
         raise LogError(
             f"{readers[0].path}: no MAVLink of the link {link!r} in the log; a trajectory needs an autopilot"
         )
-    boots = autopilot.boots(kept)
+    vehicles = autopilot.vehicles(kept)
     runs = _runs(readers, samples.samples(), lidar)
     if not runs:
         raise LogError(f"{readers[0].path}: no lidar packets in the log")
-    return Flight(boots, runs, lidar, count, parser.bad_bytes, parser.unknown)
+    choice = vehicle.choose(vehicles, runs)
+    return Flight(choice.vehicle.boots, runs, lidar, choice, count, parser.bad_bytes, parser.unknown)
 
 
 def _frames(

@@ -18,7 +18,7 @@ from flightlog.errors import ClockError, SyncError
 from flightlog.nmea import Rmc
 from groundproc.flight import sync, timebase
 from groundproc.flight.autopilot import Boot
-from groundproc.flight.sync import GyroTrack, Sync
+from groundproc.flight.sync import LEAST_PEAK, GyroTrack, Peak, Sync
 from groundproc.flight.timebase import HostLine, UtcTie
 
 Array = npt.NDArray[np.float64]
@@ -226,6 +226,36 @@ def _overlap(run: LidarRun, boot: Boot) -> HostLine | None:
         return None
     common = min(int(host_ns.max()), run.last_receive_ns) - max(int(host_ns.min()), run.first_receive_ns)
     return timebase.host_line(boot_ns, host_ns) if common >= LEAST_OVERLAP_NS else None
+
+
+def likeness(run: LidarRun, boot: Boot) -> Peak | None:
+    """How well the gyros of a boot fit the lidar's at the best shift there is; None where the two were not heard together.
+
+    The highest of all series of gyros counts: a stranger's fit by none.
+
+    Raises
+    ------
+    SyncError
+        They cannot be compared: no gyros, or no motion.
+    """
+    boot_line = _overlap(run, boot)
+    if boot_line is None:
+        return None
+    if run.gyro is None:
+        raise SyncError("lidar: no gyro readings in its position packets (UDP port 8308)")
+    host, peaks, reasons = _host_sync(run, boot_line), [], []
+    for track in boot.gyros():
+        for expected_ns in (host.offset_ns, None):
+            try:
+                peaks.append(sync.best_shift(run.gyro, track, None, expected_ns, SEARCH_S))
+            except SyncError as error:
+                reasons.append(error)
+                continue
+            if peaks[-1].height >= LEAST_PEAK:
+                break
+    if not peaks:
+        raise reasons[0] if reasons else SyncError("MAVLink: no gyro rates (ATTITUDE, RAW_IMU) of the autopilot")
+    return max(peaks, key=lambda peak: peak.height)
 
 
 def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: Array, how: str) -> Sync:

@@ -51,6 +51,8 @@ def work(run: Run, folders: Folders) -> None:
             "system": main.boot.system,
             "component": main.boot.component,
             "boots": len(flight.boots),
+            "vehicles": flight.choice.described(),
+            "notes": list(flight.choice.notes),
             "frames": flight.frames,
             "bad_bytes": flight.bad_bytes,
             "unknown_frames": flight.unknown,
