@@ -83,9 +83,18 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
         "lidar_run": leg.run,
         "attitude_from": ins.attitude_source(leg.boot),
         "position_from": ins.position_source(leg.boot),
+        "positions": describe_positions(leg),
         "utc": {"source": leg.utc.source, "sigma_s": leg.utc.sigma_ns * 1e-9},
         "sync": describe_sync(leg),
     }
+
+
+def describe_positions(leg: Leg) -> dict[str, Any] | None:
+    """What became of the positions of a leg; None where there are none."""
+    if not ins.has_position(leg.boot):
+        return None
+    fixes = ins.position_fixes(leg.boot, "msl")
+    return {"used": len(fixes.time_ns), "left_out": fixes.left_out, "note": fixes.note}
 
 
 def describe_sync(leg: Leg) -> dict[str, Any]:
