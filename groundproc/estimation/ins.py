@@ -177,6 +177,8 @@ def _global_positions(boot: Boot, height: str) -> PositionFixes:
         raise LogError("MAVLink: GLOBAL_POSITION_INT holds no position; the autopilot never had a fix")
     table, time_ns = table[known], time_ns[known]
     field = "relative_alt" if height == "relative" else "alt"
+    if field not in (table.dtype.names or ()):
+        raise LogError("dataflash: POS has no height above home; --height msl takes that above the sea")
     velocity = np.stack([table["vy"], table["vx"], -table["vz"].astype(np.float64)], axis=1) * 0.01
     return PositionFixes(
         "GLOBAL_POSITION_INT",

@@ -6,7 +6,7 @@ All times here are nanoseconds since boot. A reboot inside a file begins a new s
 import itertools
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -63,6 +63,12 @@ class Boot:
         Message name to its table (`mavlink.table`), in order of reception, without repeats.
     stamps_ns : dict of str to ndarray of int64
         Time since boot of each row [ns]; rows without a stamp of their own have that of the stamped message before.
+    heard : tuple of two ndarrays of int64, shape (n,), or None
+        Boot times and receive times [ns] where the tables do not tell them: of the board's own log.
+    heard_by : str
+        What receive times are: "link", or "gps" where UTC of the GPS module stands in their place.
+    origins : dict of str to str
+        Where tables come from that are not of the link: those of the board's own log.
     """
 
     number: int
@@ -70,6 +76,9 @@ class Boot:
     component: int
     tables: dict[str, npt.NDArray[np.void]]
     stamps_ns: dict[str, npt.NDArray[np.int64]]
+    heard: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None = None
+    heard_by: str = "link"
+    origins: dict[str, str] = field(default_factory=dict)
 
     def has(self, name: str, least: int = 2) -> bool:
         """Whether there are at least so many messages of a kind."""
@@ -82,6 +91,8 @@ class Boot:
 
     def host_pairs(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Boot time and receive time [ns] of all messages that carry their own boot time."""
+        if self.heard is not None:
+            return self.heard
         names = [
             n for n in ("ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "SYSTEM_TIME") if n in self.tables
         ]
@@ -102,13 +113,17 @@ class Boot:
             ("SCALED_IMU", ("xgyro", "ygyro", "zgyro"), 1e-3),
             ("HIGHRES_IMU", ("xgyro", "ygyro", "zgyro"), 1.0),
         ):
-            if self.has(name, 30):
+            if self.has(name, 30) and not self._borrows_gyro(name):
                 frd = np.stack([self.tables[name][f].astype(np.float64) for f in fields], axis=1) * unit
                 if np.ptp(frd, axis=0).max() > 0.0:
-                    whole_ms = "time_boot_ms" in (self.tables[name].dtype.names or ())
+                    whole_ms = (self.stamps_ns[name] % NS_PER_MS == HALF_MS_NS).all()
                     step_ns = NS_PER_MS if whole_ms else NS_PER_US
                     tracks.append(GyroTrack(name, self.stamps_ns[name], frames.ins_from_frd(frd), step_ns))
         return tracks
+
+    def _borrows_gyro(self, name: str) -> bool:
+        """Whether the rates of a message are only those of another at other times: ATT has none of its own."""
+        return name == "ATTITUDE" and name in self.origins and "HIGHRES_IMU" in self.tables
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,15 +135,19 @@ class Vehicle:
     addresses : tuple of (int, int)
         System and component, in the order in which it used them: an id may be changed in flight.
     boots : list of Boot
+    source : str
+        Where it was heard, if not on the link.
     """
 
     addresses: tuple[Address, ...]
     boots: list[Boot]
+    source: str = ""
 
     @property
     def name(self) -> str:
         """Its addresses, such as 1/1."""
-        return ", then ".join(f"{system}/{component}" for system, component in self.addresses)
+        addresses = ", then ".join(f"{system}/{component}" for system, component in self.addresses)
+        return f"{addresses} of {self.source}" if self.source else addresses
 
 
 def vehicles(all_frames: Sequence[Frame]) -> list[Vehicle]:
@@ -226,7 +245,7 @@ def _boot(number: int, address: tuple[int, int], mine: Sequence[Frame], clock_ms
             continue
         table = mavlink.table([mine[i] for i in rows.tolist()], name)
         stamp_ns = _stamps_ns(table, clock_ms[rows])
-        keep = _increasing(stamp_ns)
+        keep = increasing(stamp_ns)
         tables[name], stamps[name] = table[keep], stamp_ns[keep]
     return Boot(number, *address, tables, stamps)
 
@@ -248,7 +267,7 @@ def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> 
     return clock_ms * NS_PER_MS + HALF_MS_NS
 
 
-def _increasing(stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def increasing(stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Rows later than all before them: repeats and late-comers are left out."""
     highest = np.maximum.accumulate(stamp_ns)
     keep = np.ones(len(stamp_ns), np.bool_)

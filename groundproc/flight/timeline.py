@@ -204,8 +204,11 @@ def legs(runs: Sequence[LidarRun], boots: Sequence[Boot], mat_ins_lidar: Array, 
         for boot in boots:
             boot_line = _overlap(run, boot)
             if boot_line is None:
+                boot_line, match = _by_gyros_alone(run, boot, mat_ins_lidar, how)
+            else:
+                match = _synchronise(run, boot, boot_line, mat_ins_lidar, how)
+            if boot_line is None or match is None:
                 continue
-            match = _synchronise(run, boot, boot_line, mat_ins_lidar, how)
             if line is None or tie is None:
                 tie = timebase.boot_utc(boot) or timebase.host_utc(boot_line, boot_line.reference_ns)
                 line = (_line(match), Line(tie.offset_ns))
@@ -226,6 +229,20 @@ def _overlap(run: LidarRun, boot: Boot) -> HostLine | None:
         return None
     common = min(int(host_ns.max()), run.last_receive_ns) - max(int(host_ns.min()), run.first_receive_ns)
     return timebase.host_line(boot_ns, host_ns) if common >= LEAST_OVERLAP_NS else None
+
+
+def _by_gyros_alone(
+    run: LidarRun, boot: Boot, mat_ins_lidar: Array, how: str
+) -> tuple[HostLine, Sync] | tuple[None, None]:
+    """A board's own log that by UTC does not go with the lidar, whose computer may have had no clock: where its gyros fit nevertheless."""
+    boot_ns, host_ns = boot.host_pairs()
+    if boot.heard_by != "gps" or how == "host" or len(boot_ns) < 2:
+        return None, None
+    line = timebase.host_line(boot_ns, host_ns)
+    try:
+        return line, _gyro_sync(run, boot, mat_ins_lidar, _host_sync(run, line))
+    except SyncError:
+        return None, None
 
 
 def likeness(run: LidarRun, boot: Boot) -> Peak | None:
@@ -267,7 +284,13 @@ def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: 
     except SyncError as error:
         if how == "gyro":
             raise
-        return replace(host, note=f"receive times only, because: {error}")
+        return replace(host, note=f"{_HOST_NOTES[boot.heard_by]}, because: {error}")
+
+
+_HOST_NOTES: Final = {
+    "link": "receive times only",
+    "gps": "UTC of the autopilot's GPS and of the lidar's computer only",
+}
 
 
 def _host_sync(run: LidarRun, boot_line: HostLine) -> Sync:

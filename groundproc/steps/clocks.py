@@ -56,6 +56,8 @@ def work(run: Run, folders: Folders) -> None:
             "frames": flight.frames,
             "bad_bytes": flight.bad_bytes,
             "unknown_frames": flight.unknown,
+            "board_logs": flight.board_logs,
+            "board_log_bad_bytes": flight.board_bad_bytes,
         },
     }
     path = folders[WHOLE] / FOUND
@@ -84,6 +86,7 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
         "attitude_from": ins.attitude_source(leg.boot),
         "position_from": ins.position_source(leg.boot),
         "positions": describe_positions(leg),
+        "from_board_log": leg.boot.origins,
         "utc": {"source": leg.utc.source, "sigma_s": leg.utc.sigma_ns * 1e-9},
         "sync": describe_sync(leg),
     }
