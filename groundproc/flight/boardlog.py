@@ -49,10 +49,13 @@ class BoardLogs:
     ----------
     bad_bytes : int
         Bytes of all of them that belong to no message.
+    not_finite : int
+        Messages that were left out because a value in them is no number.
     """
 
     def __init__(self) -> None:
         self.bad_bytes = 0
+        self.not_finite = 0
         self._parser: Parser | None = None
         self._next_ns = 0
         self._boots: list[Boot] = []
@@ -76,14 +79,15 @@ class BoardLogs:
             return
         log = self._parser.finish()
         self.bad_bytes += log.bad_bytes
-        boot = boot_of(log, len(self._boots))
+        boot, not_finite = boot_of(log, len(self._boots))
+        self.not_finite += not_finite
         if boot is not None:
             self._boots.append(boot)
         self._parser = None
 
 
-def boot_of(log: Dataflash, number: int = 0) -> Boot | None:
-    """The tables of one log; None where nothing in it has a time.
+def boot_of(log: Dataflash, number: int = 0) -> tuple[Boot | None, int]:
+    """The tables of one log, None where nothing in it has a time; and how many messages were left out for values that are no numbers.
 
     Parameters
     ----------
@@ -93,14 +97,16 @@ def boot_of(log: Dataflash, number: int = 0) -> Boot | None:
         Of the boot.
     """
     found: dict[str, tuple[str, Times, dict[str, Array]]] = {}
+    not_finite = 0
     for name, source, stamp_ns, columns in _converted(log):
         finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
+        not_finite += int((~finite).sum())
         keep = np.flatnonzero(finite)
         keep = keep[increasing(stamp_ns[keep])]
         if len(keep):
             found[name] = source, stamp_ns[keep], {key: column[keep] for key, column in columns.items()}
     if not found:
-        return None
+        return None, not_finite
     if "ATTITUDE" in found:
         _add_rates(found)
     tables = {name: _table(columns) for name, (_, _, columns) in found.items()}
@@ -112,7 +118,7 @@ def boot_of(log: Dataflash, number: int = 0) -> Boot | None:
             tables[name] = log.tables[name]
             own = _stamps_ns(log, name)
             stamps[name] = np.full(len(tables[name]), first_ns) if own is None else own
-    return Boot(number, _system(log), 1, tables, stamps, _heard(stamps, tables), "gps", origins)
+    return Boot(number, _system(log), 1, tables, stamps, _heard(stamps, tables), "gps", origins), not_finite
 
 
 def _converted(log: Dataflash) -> Iterator[tuple[str, str, Times, dict[str, Array]]]:
@@ -188,9 +194,15 @@ def _filtered_imu(log: Dataflash, name: str) -> tuple[str, Times, dict[str, Arra
     names = log.tables[name].dtype.names or ()
     for instance in np.unique(log.tables[name]["I"]).tolist() if "I" in names else [None]:
         made = _rows(log, name, list(labels.values()), instance)
-        if made is not None and np.ptp(made[1]["GyrX"]) > 0.0:
+        if made is not None and _varies(made[1]["GyrX"]):
             return name, made[0], {key: made[1][label] for key, label in labels.items()}
     return None
+
+
+def _varies(values: Array) -> bool:
+    """Whether a sensor is alive."""
+    finite = values[np.isfinite(values)]
+    return len(finite) > 0 and bool(np.ptp(finite) > 0.0)
 
 
 def _raw_imu(log: Dataflash) -> tuple[str, Times, dict[str, Array]] | None:
@@ -340,7 +352,8 @@ def _accuracy(log: Dataflash, time_ns: Times, alt_m: Array, instance: int | None
     geoid = _rows(log, "GPA", ["Und"], instance)
     if geoid is not None and np.any(geoid[1]["Und"]):
         columns["alt_ellipsoid"] = np.where(near, (alt_m + geoid[1]["Und"][row]) * 1e3, 0.0)
-    return columns
+    # what is no number is not known; the fix itself may be good
+    return {name: np.nan_to_num(column, nan=65535.0 if name == "epv" else 0.0) for name, column in columns.items()}
 
 
 def _pressure(log: Dataflash) -> tuple[str, str, Times, dict[str, Array]] | None:

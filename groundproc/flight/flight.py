@@ -38,8 +38,8 @@ class Flight:
         Whose boots these are, of the vehicles on the link.
     frames, bad_bytes, unknown : int
         MAVLink: frames read, bytes that belong to none, frames of messages outside the dialect.
-    board_logs, board_bad_bytes : int
-        Dataflash logs of the autopilot, and bytes in them that belong to no message.
+    board_logs, board_bad_bytes, board_not_finite : int
+        Dataflash logs of the autopilot, bytes in them that belong to no message, and messages left out for values that are no numbers.
     """
 
     boots: list[Boot]
@@ -51,6 +51,7 @@ class Flight:
     unknown: int = 0
     board_logs: int = 0
     board_bad_bytes: int = 0
+    board_not_finite: int = 0
 
 
 def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | None = None) -> Flight:
@@ -80,7 +81,16 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     choice = vehicle.choose(merged.vehicles, runs)
     choice = replace(choice, notes=choice.notes + merged.notes)
     return Flight(
-        choice.vehicle.boots, runs, lidar, choice, count, parser.bad_bytes, parser.unknown, len(boards), logs.bad_bytes
+        choice.vehicle.boots,
+        runs,
+        lidar,
+        choice,
+        count,
+        parser.bad_bytes,
+        parser.unknown,
+        len(boards),
+        logs.bad_bytes,
+        logs.not_finite,
     )
 
 

@@ -18,6 +18,8 @@ LARGEST_DRIFT: Final = 300e-6
 LEAST_DRIFT_SPAN_S: Final = 60.0
 PLAUSIBLE_UTC_NS: Final = (946_684_800 * NS_PER_S, 4_102_444_800 * NS_PER_S)
 """2000 to 2100: what lies outside is no date but a counter."""
+RECEIVER_LATE_NS: Final = 150.0 * NS_PER_MS
+"""From a fix's epoch to its place in the log: 0.1 to 0.2 s with the receivers of such boards (AP_GPS, get_lag)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +150,9 @@ def boot_utc(boot: Boot) -> UtcTie | None:
     # the first fixes may come with a wrong second: keep what agrees with the majority
     near = offset_ns[np.abs(offset_ns - np.median(offset_ns)) < NS_PER_S]
     spread = float(np.median(near.max() - near)) if len(near) > 1 else 0.2 * NS_PER_S
-    return UtcTie(int(near.max()), max(spread, float(NS_PER_MS)), "system_time")
+    # a fix in the board's own log is as late as its receiver and the driver are; all are so by nearly the same
+    least = RECEIVER_LATE_NS if "SYSTEM_TIME" in boot.origins else float(NS_PER_MS)
+    return UtcTie(int(near.max()), max(spread, least), "system_time")
 
 
 def host_utc(line: HostLine, device_ns: int) -> UtcTie:

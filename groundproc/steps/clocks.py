@@ -58,6 +58,7 @@ def work(run: Run, folders: Folders) -> None:
             "unknown_frames": flight.unknown,
             "board_logs": flight.board_logs,
             "board_log_bad_bytes": flight.board_bad_bytes,
+            "board_log_not_finite": flight.board_not_finite,
         },
     }
     path = folders[WHOLE] / FOUND
