@@ -163,21 +163,26 @@ class Parser:
         heads = np.flatnonzero((raw[:-2] == HEAD[0]) & (raw[1:-1] == HEAD[1])) if end >= 3 else np.empty(0, np.int64)
         kinds = raw[heads + 2]
         at, done, taken = 0, 0, 0
+        pending: list[npt.NDArray[np.int64]] = []
         while at < len(heads):
             chosen, at, waits = self._walk(heads, kinds, at, end)
-            sizes = self._sizes()[kinds[chosen]]
-            self._take(raw, heads[chosen], kinds[chosen])
+            pending.append(chosen)
             if len(chosen):
+                sizes = self._sizes()[kinds[chosen]]
                 done = int(heads[chosen[-1]] + sizes[-1])
                 taken += int(sizes.sum())
+            if at < len(heads) and kinds[at] == _FMT and heads[at] + _FMT_BYTES <= end:
+                self._take(raw, heads, kinds, pending)
             while at < len(heads) and kinds[at] == _FMT and heads[at] + _FMT_BYTES <= end:
                 self._declare(data[heads[at] + 3 : heads[at] + _FMT_BYTES])
                 done, taken = int(heads[at]) + _FMT_BYTES, taken + _FMT_BYTES
                 at = int(np.searchsorted(heads, done))
             if waits and not last:
+                self._take(raw, heads, kinds, pending)
                 self._bad_bytes += int(heads[at]) - taken
                 return int(heads[at])
             at += waits
+        self._take(raw, heads, kinds, pending)
         # two bytes may be the beginning of a head
         done = end if last else max(done, end - 2)
         self._bad_bytes += done - taken
@@ -214,8 +219,17 @@ class Parser:
             at = step[at - low]
         return np.array(chosen, np.int64), at, False
 
-    def _take(self, raw: npt.NDArray[np.uint8], places: npt.NDArray[np.int64], kinds: npt.NDArray[np.uint8]) -> None:
-        """Keep the bodies of messages at some places."""
+    def _take(
+        self,
+        raw: npt.NDArray[np.uint8],
+        heads: npt.NDArray[np.int64],
+        kinds: npt.NDArray[np.uint8],
+        pending: list[npt.NDArray[np.int64]],
+    ) -> None:
+        """Keep the bodies of the messages that were found since the last declaration."""
+        chosen = np.concatenate([np.empty(0, np.int64), *pending])
+        pending.clear()
+        places, kinds = heads[chosen], kinds[chosen]
         for number in np.unique(kinds).tolist():
             kind = self._formats[number]
             mine = places[kinds == number]
