@@ -5,7 +5,7 @@ their own receive times, and frames whose checksum cannot be verified must not p
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 from functools import cache
 from typing import Any, Final, NamedTuple
@@ -279,22 +279,6 @@ def table(frames: Sequence[Frame], name: str) -> npt.NDArray[np.void]:
     for field in dtype.names:
         out[field] = payload[field]
     return out
-
-
-def autopilots(frames: Iterable[Frame]) -> list[tuple[int, int]]:
-    """(system, component) of every autopilot that sent a heartbeat, in order of appearance.
-
-    Ground stations, gimbals and companions say HEARTBEAT.autopilot = 8 and are left out.
-    """
-    found: dict[tuple[int, int], None] = {}
-    offset = field_offset("HEARTBEAT", "autopilot")
-    assert offset is not None
-    for frame in frames:
-        if frame.message_id == 0 and frame.known:
-            payload = frame.payload.ljust(9, b"\x00")
-            if payload[offset] != AUTOPILOT_INVALID:
-                found[(frame.system, frame.component)] = None
-    return list(found)
 
 
 def decode(frame: Frame) -> Any | None:

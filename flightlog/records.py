@@ -102,7 +102,8 @@ DATAFLASH: Final = RecordType(
     "/dataflash/",
     "swath_msgs/msg/RawBatch",
     _RAW_BATCH,
-    "An autopilot's own dataflash log (.bin), byte for byte in order; the stamps say nothing but the order.",
+    "An autopilot's own dataflash log (.bin), byte for byte in order. The stamps say nothing but the order: a nanosecond from piece to "
+    "piece, and more where another file begins.",
 )
 HOST_CLOCK: Final = RecordType(
     "/host_clock",

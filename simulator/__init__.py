@@ -19,6 +19,7 @@ scene, ground, town, lake                  the named scenes
 route, flight                              where to fly; position, attitude and rates at any time
 rays, moving, echoes, lidar, telemetry     beams against triangles; cars and people; echoes of a beam; data packets; position packets
 imu, ins, autopilot                        constant errors of inertial sensors; what the INS believes; what it says over MAVLink
+boardlog                                   what it writes on its own card
 faults, capture, truth, render             what goes wrong; pcap and tlog; truth files; the chunks in order
 play, command                              live to UDP and a pty; `swath simulate`
 """

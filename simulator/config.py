@@ -203,6 +203,18 @@ class LinkOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class BoardOptions:
+    """The log on the autopilot's own card: rates and what its receiver states."""
+
+    imu_hz: float = option(50.0, "rate of IMU; 400 with IMU_FAST", minimum=0, maximum=1000)
+    attitude_hz: float = option(25.0, "rate of ATT", minimum=0, maximum=400)
+    position_hz: float = option(10.0, "rate of POS and XKF1", minimum=0, maximum=400)
+    gps_hz: float = option(5.0, "rate of GPS and GPA", minimum=0, maximum=20)
+    slow_hz: float = option(10.0, "rate of BARO and MAG", minimum=0, maximum=100)
+    stated_sigma_m: float = option(1.8, "horizontal accuracy that the receiver states [m]", minimum=0, maximum=100)
+
+
+@dataclass(frozen=True, slots=True)
 class MountOptions:
     """How the true mount differs from the nominal one that is written into the log."""
 
@@ -277,6 +289,7 @@ class Options:
     flight: FlightOptions = option(FlightOptions, "motion")
     ins: InsOptions = option(InsOptions, "errors of the autopilot's estimates")
     link: LinkOptions = option(LinkOptions, "MAVLink link")
+    board: BoardOptions = option(BoardOptions, "the log on the autopilot's own card")
     mount: MountOptions = option(MountOptions, "true mount against nominal")
     moving: MovingOptions = option(MovingOptions, "what moves in the scene")
     faults: FaultOptions = option(FaultOptions, "what goes wrong")

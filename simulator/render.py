@@ -23,6 +23,7 @@ from flightlog.hdl32e import BLOCKS, DATA_PORT, FIRING_NS, POSITION_PORT
 from flightlog.logfile import LogWriter
 from flightlog.mount import Mount
 from simulator.autopilot import Autopilot, Frame
+from simulator.boardlog import BoardLog
 from simulator.capture import PcapWriter, tlog_record
 from simulator.chance import generator
 from simulator.clocks import Clocks, clocks
@@ -39,10 +40,11 @@ from simulator.truth import COLUMNS, PointsWriter, write_json, write_poses
 
 Array = npt.NDArray[np.float64]
 
-LOG, CAPTURE, TLOG, POSES, TRUTH, POINTS = (
+LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH, POINTS = (
     "flight.mcap",
     "capture.pcap",
     "telemetry.tlog",
+    "board.bin",
     "truth.csv",
     "truth.json",
     "truth_points.npy",
@@ -217,7 +219,7 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
     SwathError
         The directory cannot be written.
     """
-    names = [LOG, CAPTURE, TLOG, POSES, TRUTH] + [POINTS] * job.truth_points
+    names = [LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH] + [POINTS] * job.truth_points
     parts = {name: job.directory / f"{name}.part" for name in names}
     simulation = Simulation(job)
     try:
@@ -254,6 +256,10 @@ class Recording:
         )
         self._pcap = PcapWriter(self._open(parts[CAPTURE]), self._options.capture_resolution)
         self._tlog = self._open(parts[TLOG])
+        job = simulation.job
+        self._board = BoardLog(
+            self._open(parts[BOARD]), simulation.ins, simulation.clocks, job.options, simulation.origin, job.seed
+        )
         self._poses = self._files.enter_context(parts[POSES].open("w", encoding="utf-8"))
         self._poses.write(COLUMNS + "\n")
         self._points = self._files.enter_context(PointsWriter(self._open(parts[POINTS]))) if POINTS in parts else None
@@ -289,6 +295,7 @@ class Recording:
         rate_hz = self._options.truth_hz
         grid = np.arange(np.ceil(start_s * rate_hz - 1e-9), np.ceil(end_s * rate_hz - 1e-9)) / rate_hz
         simulation = self._simulation
+        self._board.add(start_s, end_s, chunk)
         write_poses(self._poses, simulation.flight, simulation.clocks, simulation.origin, grid)
 
     def _arrival_ns(self, sent_s: Array, rng: np.random.Generator) -> npt.NDArray[np.int64]:

@@ -43,6 +43,10 @@ class Simulated:
         return self.folder / "telemetry.tlog"
 
     @property
+    def board(self) -> Path:
+        return self.folder / "board.bin"
+
+    @property
     def poses_file(self) -> Path:
         return self.folder / "truth.csv"
 
@@ -64,11 +68,11 @@ class Simulated:
 
 def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int, points: bool) -> None:
     """All files of a simulation, with the lidar's data packets of one 0.1 s in `every` only: rays are what costs."""
-    from simulator.render import CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Job, Recording, Simulation
+    from simulator.render import BOARD, CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Job, Recording, Simulation
     from simulator.truth import write_json
 
     simulation = Simulation(Job(scene, seconds, seed, folder, options))
-    names = [LOG, CAPTURE, TLOG, POSES] + [POINTS] * points
+    names = [LOG, CAPTURE, TLOG, BOARD, POSES] + [POINTS] * points
     with Recording(simulation, {name: folder / name for name in names}) as recording:
         for chunk in range(simulation.chunks):
             recording.add(chunk, simulation.sweep(chunk) if chunk % every == 0 else simulation.lidar.sweep(0, 0))

@@ -70,6 +70,11 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     quality = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
     print(json.dumps(quality, indent=2) if arguments.json else _report(quality, folder))
+    of_positions = [
+        leg["positions"]["note"] for leg in quality["legs"] if leg["positions"] and leg["positions"]["note"]
+    ]
+    for note in dict.fromkeys(quality["autopilot"]["notes"] + of_positions):
+        print(f"swath: {note}", file=sys.stderr)
     if quality["trajectory"]["warning"]:
         print(f"swath: {quality['trajectory']['warning']}", file=sys.stderr)
         return 1

@@ -15,6 +15,7 @@ from flightlog import frames
 from flightlog.constants import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
 from flightlog.errors import LogError
 from flightlog.mount import Mount
+from groundproc.estimation import glitches
 from groundproc.estimation.alignment import align
 from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
@@ -63,6 +64,10 @@ class PositionFixes:
     velocity_m_s : ndarray, shape (n, 3), or None
         East, north, up.
     sigma_m : ndarray, shape (n, 3)
+    left_out : int
+        Glitches: positions that jumped away and came back.
+    note : str
+        What became of jumps; empty where there are none.
     """
 
     source: str
@@ -72,6 +77,8 @@ class PositionFixes:
     height_m: Array
     velocity_m_s: Array | None
     sigma_m: Array
+    left_out: int = 0
+    note: str = ""
 
 
 def position_fixes(boot: Boot, height: str, undulation_m: float | None = None) -> PositionFixes:
@@ -96,11 +103,44 @@ def position_fixes(boot: Boot, height: str, undulation_m: float | None = None) -
         fixes = _gps_positions(boot, height)
     else:
         raise LogError("MAVLink: neither GLOBAL_POSITION_INT nor GPS_RAW_INT in the log; a position is needed")
+    fixes = _without_glitches(fixes)
     if height != "ellipsoid":
         return fixes
     if undulation_m is None:
         undulation_m = _undulation(boot)
     return replace(fixes, height_m=fixes.height_m + undulation_m)
+
+
+def _without_glitches(fixes: PositionFixes) -> PositionFixes:
+    """The positions that hold, and what is to be said of the others."""
+    place = [float(np.median(v)) for v in (fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)]
+    enu = LocalFrame(*place).from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)
+    time_s: Array = np.asarray((fixes.time_ns - fixes.time_ns[0]) * 1e-9, np.float64)
+    found = glitches.judge(time_s, np.asarray(enu, np.float64), fixes.velocity_m_s)
+    kept, left_out = found.kept, int((~found.kept).sum())
+    notes = []
+    if left_out:
+        at_s = float(time_s[~kept][0])
+        notes.append(
+            f"{left_out} positions of {fixes.source} left out: from {at_s:.1f} s after the first one they jump away by up to "
+            f"{found.farthest_m:.0f} m"
+        )
+    notes += [
+        f"positions of {fixes.source} shift by {size_m:.0f} m at {at_s:.1f} s and stay there; nothing contradicts them"
+        for at_s, size_m in found.shifts
+    ]
+    velocity = None if fixes.velocity_m_s is None else fixes.velocity_m_s[kept]
+    return PositionFixes(
+        fixes.source,
+        fixes.time_ns[kept],
+        fixes.latitude_deg[kept],
+        fixes.longitude_deg[kept],
+        fixes.height_m[kept],
+        velocity,
+        fixes.sigma_m[kept],
+        left_out,
+        "; ".join(notes),
+    )
 
 
 def position_source(boot: Boot) -> str | None:
@@ -137,6 +177,8 @@ def _global_positions(boot: Boot, height: str) -> PositionFixes:
         raise LogError("MAVLink: GLOBAL_POSITION_INT holds no position; the autopilot never had a fix")
     table, time_ns = table[known], time_ns[known]
     field = "relative_alt" if height == "relative" else "alt"
+    if field not in (table.dtype.names or ()):
+        raise LogError("dataflash: POS has no height above home; --height msl takes that above the sea")
     velocity = np.stack([table["vy"], table["vx"], -table["vz"].astype(np.float64)], axis=1) * 0.01
     return PositionFixes(
         "GLOBAL_POSITION_INT",

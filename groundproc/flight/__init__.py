@@ -5,6 +5,7 @@ importers         logs made of captures and telemetry of other programs
 autopilot         MAVLink as tables, boot by boot
 positions         GNSS solutions and poses of other programs
 sync              the clocks of lidar and autopilot, from their gyros
+vehicle           which of several autopilots on a link carried the lidar
 timebase          clocks against receive times and UTC
 timeline          all clocks on one scale, leg by leg
 mounting, control what a user states: the mount, surveyed points

@@ -4,8 +4,9 @@ All times here are nanoseconds since boot. A reboot inside a file begins a new s
 """
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from flightlog import frames, mavlink
 from flightlog.constants import NS_PER_MS, NS_PER_US
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame
+from flightlog.vehicles import Address, Sender, Vehicles
 from groundproc.flight.sync import GyroTrack
 
 Array = npt.NDArray[np.float64]
@@ -61,6 +63,12 @@ class Boot:
         Message name to its table (`mavlink.table`), in order of reception, without repeats.
     stamps_ns : dict of str to ndarray of int64
         Time since boot of each row [ns]; rows without a stamp of their own have that of the stamped message before.
+    heard : tuple of two ndarrays of int64, shape (n,), or None
+        Boot times and receive times [ns] where the tables do not tell them: of the board's own log.
+    heard_by : str
+        What receive times are: "link", or "gps" where UTC of the GPS module stands in their place.
+    origins : dict of str to str
+        Where tables come from that are not of the link: those of the board's own log.
     """
 
     number: int
@@ -68,6 +76,9 @@ class Boot:
     component: int
     tables: dict[str, npt.NDArray[np.void]]
     stamps_ns: dict[str, npt.NDArray[np.int64]]
+    heard: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None = None
+    heard_by: str = "link"
+    origins: dict[str, str] = field(default_factory=dict)
 
     def has(self, name: str, least: int = 2) -> bool:
         """Whether there are at least so many messages of a kind."""
@@ -80,6 +91,8 @@ class Boot:
 
     def host_pairs(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Boot time and receive time [ns] of all messages that carry their own boot time."""
+        if self.heard is not None:
+            return self.heard
         names = [
             n for n in ("ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "SYSTEM_TIME") if n in self.tables
         ]
@@ -100,17 +113,48 @@ class Boot:
             ("SCALED_IMU", ("xgyro", "ygyro", "zgyro"), 1e-3),
             ("HIGHRES_IMU", ("xgyro", "ygyro", "zgyro"), 1.0),
         ):
-            if self.has(name, 30):
+            if self.has(name, 30) and not self._borrows_gyro(name):
                 frd = np.stack([self.tables[name][f].astype(np.float64) for f in fields], axis=1) * unit
                 if np.ptp(frd, axis=0).max() > 0.0:
-                    whole_ms = "time_boot_ms" in (self.tables[name].dtype.names or ())
+                    whole_ms = (self.stamps_ns[name] % NS_PER_MS == HALF_MS_NS).all()
                     step_ns = NS_PER_MS if whole_ms else NS_PER_US
                     tracks.append(GyroTrack(name, self.stamps_ns[name], frames.ins_from_frd(frd), step_ns))
         return tracks
 
+    def _borrows_gyro(self, name: str) -> bool:
+        """Whether the rates of a message are only those of another at other times: ATT has none of its own."""
+        return name == "ATTITUDE" and name in self.origins and "HIGHRES_IMU" in self.tables
 
-def boots(all_frames: Sequence[Frame]) -> list[Boot]:
-    """Sort a link's frames into boots of its autopilot.
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """One autopilot of those on a link.
+
+    Attributes
+    ----------
+    addresses : tuple of (int, int)
+        System and component, in the order in which it used them: an id may be changed in flight.
+    boots : list of Boot
+    source : str
+        Where it was heard, if not on the link.
+    """
+
+    addresses: tuple[Address, ...]
+    boots: list[Boot]
+    source: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its addresses, such as 1/1."""
+        addresses = ", then ".join(f"{system}/{component}" for system, component in self.addresses)
+        return f"{addresses} of {self.source}" if self.source else addresses
+
+
+def vehicles(all_frames: Sequence[Frame]) -> list[Vehicle]:
+    """Sort a link's frames into vehicles and their boots, first the one that `flightlog.vehicles` elects for most of the time.
+
+    An address that was never heard together with another, and only after it, is the same vehicle under a new id, until the gyros
+    contradict (`vehicle.choose`).
 
     Parameters
     ----------
@@ -120,14 +164,43 @@ def boots(all_frames: Sequence[Frame]) -> list[Boot]:
     Raises
     ------
     LogError
-        No autopilot sent a heartbeat.
+        No autopilot was heard.
     """
-    address = _autopilot(all_frames)
-    mine = [f for f in all_frames if f.known and (f.system, f.component) == address]
+    heard, elected = Vehicles(), Counter[Address]()
+    for frame in all_frames:
+        heard.hear(frame)
+        if heard.autopilot is not None:
+            elected[heard.autopilot] += 1
+    chains = _chains({address: sender for address, sender in heard.senders.items() if sender.is_vehicle})
+    if not chains:
+        raise LogError("MAVLink: no heartbeat of an autopilot and no attitudes in the log, expected one a second")
+    chains.sort(key=lambda chain: -sum(elected[address] for address in chain))
+    return [Vehicle(tuple(chain), _boots(all_frames, chain)) for chain in chains]
+
+
+def boots(all_frames: Sequence[Frame]) -> list[Boot]:
+    """The boots of the elected vehicle; see `vehicles`."""
+    return vehicles(all_frames)[0].boots
+
+
+def _chains(senders: Mapping[Address, Sender]) -> list[list[Address]]:
+    """Addresses that follow each other in time, without ever being heard together."""
+    chains: list[list[Address]] = []
+    for address in sorted(senders, key=lambda each: senders[each].first_ns):
+        before = [chain for chain in chains if senders[chain[-1]].newest_ns < senders[address].first_ns]
+        if before:
+            max(before, key=lambda chain: senders[chain[-1]].newest_ns).append(address)
+        else:
+            chains.append([address])
+    return chains
+
+
+def _boots(all_frames: Sequence[Frame], addresses: Collection[Address]) -> list[Boot]:
+    mine = [f for f in all_frames if f.known and (f.system, f.component) in addresses]
     clock_ms = _running_clock_ms(mine)
     starts = [0, *_reboots(mine, clock_ms), len(mine)]
     return [
-        _boot(number, address, mine[a:b], clock_ms[a:b])
+        _boot(number, (mine[a].system, mine[a].component), mine[a:b], clock_ms[a:b])
         for number, (a, b) in enumerate(itertools.pairwise(starts))
         if b > a
     ]
@@ -145,18 +218,6 @@ def _reboots(mine: Sequence[Frame], clock_ms: npt.NDArray[np.int64]) -> list[int
     counted_ms = np.diff(clock_ms[own])
     reboot = (counted_ms < -REBOOT_MS) | (passed_ms - counted_ms > LOST_MS)
     return [int(i) for i in own[1:][reboot]]
-
-
-def _autopilot(all_frames: Sequence[Frame]) -> tuple[int, int]:
-    """The autopilot that says most, should there be several."""
-    addresses = mavlink.autopilots(all_frames)
-    if not addresses:
-        raise LogError("MAVLink: no heartbeat of an autopilot in the log, expected one a second")
-    counts = dict.fromkeys(addresses, 0)
-    for frame in all_frames:
-        if (frame.system, frame.component) in counts:
-            counts[(frame.system, frame.component)] += 1
-    return max(counts, key=lambda address: counts[address])
 
 
 def _running_clock_ms(mine: Sequence[Frame]) -> npt.NDArray[np.int64]:
@@ -184,7 +245,7 @@ def _boot(number: int, address: tuple[int, int], mine: Sequence[Frame], clock_ms
             continue
         table = mavlink.table([mine[i] for i in rows.tolist()], name)
         stamp_ns = _stamps_ns(table, clock_ms[rows])
-        keep = _increasing(stamp_ns)
+        keep = increasing(stamp_ns)
         tables[name], stamps[name] = table[keep], stamp_ns[keep]
     return Boot(number, *address, tables, stamps)
 
@@ -206,7 +267,7 @@ def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> 
     return clock_ms * NS_PER_MS + HALF_MS_NS
 
 
-def _increasing(stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def increasing(stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Rows later than all before them: repeats and late-comers are left out."""
     highest = np.maximum.accumulate(stamp_ns)
     keep = np.ones(len(stamp_ns), np.bool_)

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +11,14 @@ from flightlog import nmea, records
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame, FrameParser
-from groundproc.flight import autopilot, load, timebase
+from groundproc.flight import autopilot, load, merging, timebase, vehicle
 from groundproc.flight.autopilot import Boot
+from groundproc.flight.boardlog import BoardLogs
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import JUMP_NS, PositionSamples
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
+from groundproc.flight.vehicle import Choice
 from groundproc.sensors.model import Lidar
 
 Progress = Callable[[int], None]
@@ -32,17 +34,24 @@ class Flight:
     runs : list of LidarRun
     lidar : Lidar
         That it was recorded with.
+    choice : Choice
+        Whose boots these are, of the vehicles on the link.
     frames, bad_bytes, unknown : int
         MAVLink: frames read, bytes that belong to none, frames of messages outside the dialect.
+    board_logs, board_bad_bytes, board_not_finite : int
+        Dataflash logs of the autopilot, bytes in them that belong to no message, and messages left out for values that are no numbers.
     """
 
     boots: list[Boot]
     runs: list[LidarRun]
     lidar: Lidar
+    choice: Choice
     frames: int = 0
     bad_bytes: int = 0
     unknown: int = 0
-    notes: list[str] = field(default_factory=list)
+    board_logs: int = 0
+    board_bad_bytes: int = 0
+    board_not_finite: int = 0
 
 
 def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | None = None) -> Flight:
@@ -55,34 +64,53 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     """
     lidar = lidar_of(readers)
     parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers, lidar))
-    count, kept = 0, []
-    for frame in _frames(readers, link, parser, samples, progress):
+    logs, count, kept = BoardLogs(), 0, []
+    for frame in _frames(readers, link, parser, (samples, logs), progress):
         count += 1
         if frame.message_id in autopilot.WANTED:  # the rest would fill the memory of an hour
             kept.append(frame)
-    if not count:
+    boards = logs.boots()
+    if not count and not boards:
         raise LogError(
-            f"{readers[0].path}: no MAVLink of the link {link!r} in the log; a trajectory needs an autopilot"
+            f"{readers[0].path}: no MAVLink of the link {link!r} in the log, and no dataflash log of its autopilot; a trajectory needs one"
         )
-    boots = autopilot.boots(kept)
+    merged = merging.merge(autopilot.vehicles(kept) if count else [], boards)
     runs = _runs(readers, samples.samples(), lidar)
     if not runs:
         raise LogError(f"{readers[0].path}: no lidar packets in the log")
-    return Flight(boots, runs, lidar, count, parser.bad_bytes, parser.unknown)
+    choice = vehicle.choose(merged.vehicles, runs)
+    choice = replace(choice, notes=choice.notes + merged.notes)
+    return Flight(
+        choice.vehicle.boots,
+        runs,
+        lidar,
+        choice,
+        count,
+        parser.bad_bytes,
+        parser.unknown,
+        len(boards),
+        logs.bad_bytes,
+        logs.not_finite,
+    )
 
 
 def _frames(
     readers: Sequence[LogReader],
     link: str,
     parser: FrameParser,
-    samples: load.PositionCollector,
+    others: tuple[load.PositionCollector, BoardLogs],
     progress: Progress | None,
 ) -> Iterator[Frame]:
-    """The frames of a link; position packets go to `samples`, so that the logs are read once for both."""
+    """The frames of a link; position packets and the board's own logs go to `others`, so that the logs are read once for all."""
+    samples, logs = others
+    topics = (records.POSITION.topic, records.DATAFLASH.topic + link, records.MAVLINK.topic + link)
     for reader in load.in_order(readers):
-        for message in reader.messages((records.POSITION.topic, records.MAVLINK.topic + link), progress):
+        for message in reader.messages(topics, progress):
             if message.topic == records.POSITION.topic:
                 samples.feed(message)
+                continue
+            if message.topic == records.DATAFLASH.topic + link:
+                logs.feed(message)
                 continue
             for time_ns, data in records.decode_raw(message.data):
                 yield from parser.feed(time_ns, data)

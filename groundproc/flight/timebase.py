@@ -23,6 +23,8 @@ LEAST_TRAILING: Final = 0.95
 LEAST_RATE_SPAN_S: Final = 5.0
 LEAST_RATE_MESSAGES: Final = 30
 _LATEST_US: Final = 1 << 53
+RECEIVER_LATE_NS: Final = 150.0 * NS_PER_MS
+"""From a fix's epoch to its place in the log: 0.1 to 0.2 s with the receivers of such boards (AP_GPS, get_lag)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +194,9 @@ def boot_utc(boot: Boot) -> UtcTie | None:
         if not len(near):  # half of them are of another era
             near = offset_ns[offset_ns > offset_ns.max() - NS_PER_S]
         spread = float(np.median(near.max() - near)) if len(near) > 1 else 0.2 * NS_PER_S
-        return UtcTie(int(near.max()), max(spread, float(NS_PER_MS)), source)
+        # a fix in the board's own log is as late as its receiver and the driver are; all are so by nearly the same
+        least = RECEIVER_LATE_NS if message in boot.origins else float(NS_PER_MS)
+        return UtcTie(int(near.max()), max(spread, least), source)
     return None
 
 

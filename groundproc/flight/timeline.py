@@ -18,7 +18,7 @@ from flightlog.errors import ClockError, SyncError
 from flightlog.nmea import Rmc
 from groundproc.flight import claims, sync, timebase
 from groundproc.flight.autopilot import Boot
-from groundproc.flight.sync import GyroTrack, Sync
+from groundproc.flight.sync import LEAST_PEAK, GyroTrack, Peak, Sync
 from groundproc.flight.timebase import HostLine, UtcTie
 
 Array = npt.NDArray[np.float64]
@@ -202,8 +202,11 @@ def legs(runs: Sequence[LidarRun], boots: Sequence[Boot], mat_ins_lidar: Array, 
         for boot in boots:
             boot_line = _overlap(run, boot)
             if boot_line is None:
+                boot_line, match = _by_gyros_alone(run, boot, mat_ins_lidar, how)
+            else:
+                match = _synchronise(run, boot, boot_line, mat_ins_lidar, how)
+            if boot_line is None or match is None:
                 continue
-            match = _synchronise(run, boot, boot_line, mat_ins_lidar, how)
             if line is None or tie is None:
                 tie, line = _utc(run, boot, boot_line, match)
             last_lidar_ns = run.line.device_ns(run.last_receive_ns)
@@ -245,6 +248,50 @@ def _overlap(run: LidarRun, boot: Boot) -> HostLine | None:
     return timebase.host_line(boot_ns, host_ns) if common >= LEAST_OVERLAP_NS else None
 
 
+def _by_gyros_alone(
+    run: LidarRun, boot: Boot, mat_ins_lidar: Array, how: str
+) -> tuple[HostLine, Sync] | tuple[None, None]:
+    """A board's own log that by UTC does not go with the lidar, whose computer may have had no clock: where its gyros fit nevertheless."""
+    boot_ns, host_ns = boot.host_pairs()
+    if boot.heard_by != "gps" or how == "host" or len(boot_ns) < 2:
+        return None, None
+    line = timebase.host_line(boot_ns, host_ns)
+    try:
+        return line, _gyro_sync(run, boot, mat_ins_lidar, _host_sync(run, line))
+    except SyncError:
+        return None, None
+
+
+def likeness(run: LidarRun, boot: Boot) -> Peak | None:
+    """How well the gyros of a boot fit the lidar's at the best shift there is; None where the two were not heard together.
+
+    The highest of all series of gyros counts: a stranger's fit by none.
+
+    Raises
+    ------
+    SyncError
+        They cannot be compared: no gyros, or no motion.
+    """
+    boot_line = _overlap(run, boot)
+    if boot_line is None:
+        return None
+    if run.gyro is None:
+        raise SyncError("lidar: no gyro readings in its position packets (UDP port 8308)")
+    host, peaks, reasons = _host_sync(run, boot_line), [], []
+    for track in boot.gyros():
+        for expected_ns in (host.offset_ns, None):
+            try:
+                peaks.append(sync.best_shift(run.gyro, track, None, expected_ns, SEARCH_S))
+            except SyncError as error:
+                reasons.append(error)
+                continue
+            if peaks[-1].height >= LEAST_PEAK:
+                break
+    if not peaks:
+        raise reasons[0] if reasons else SyncError("MAVLink: no gyro rates (ATTITUDE, RAW_IMU) of the autopilot")
+    return max(peaks, key=lambda peak: peak.height)
+
+
 def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: Array, how: str) -> Sync:
     host = _host_sync(run, boot_line)
     if how == "host":
@@ -257,7 +304,13 @@ def _synchronise(run: LidarRun, boot: Boot, boot_line: HostLine, mat_ins_lidar: 
         if how == "gyro":
             raise
         _check_rates(run, boot_line, f"; and {error}")
-        return replace(host, note=f"receive times only, because: {error}")
+        return replace(host, note=f"{_HOST_NOTES[boot.heard_by]}, because: {error}")
+
+
+_HOST_NOTES: Final = {
+    "link": "receive times only",
+    "gps": "UTC of the autopilot's GPS and of the lidar's computer only",
+}
 
 
 def _checked_drift(found: Sync) -> Sync:

@@ -7,6 +7,7 @@ from flightlog import mavlink
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame, FrameParser
+from flightlog.vehicles import Vehicles
 from groundproc.flight import autopilot
 from groundproc.flight.autopilot import REBOOT_MS, Boot
 
@@ -33,6 +34,7 @@ class Telemetry:
         self.frames = 0
         self.last_ns = 0
         self._kept: deque[Frame] = deque()
+        self._vehicles = Vehicles()
         self._heartbeats: dict[tuple[int, int], Frame] = {}
         self._stamp_ms: int | None = None
 
@@ -43,9 +45,10 @@ class Telemetry:
                 self._keep(frame)
 
     def _keep(self, frame: Frame) -> None:
+        self._vehicles.hear(frame)
         if frame.message_id == _HEARTBEAT:
             self._heartbeats[(frame.system, frame.component)] = frame
-        if frame.message_id == _ATTITUDE and (frame.system, frame.component) in self._heartbeats:
+        if frame.message_id == _ATTITUDE and (frame.system, frame.component) == self._vehicles.autopilot:
             stamp_ms = int.from_bytes(frame.payload[_STAMP_AT : _STAMP_AT + 4], "little")
             if self._stamp_ms is not None and stamp_ms < self._stamp_ms - REBOOT_MS:
                 self._kept.clear()
@@ -60,7 +63,7 @@ class Telemetry:
     @property
     def is_there(self) -> bool:
         """Whether an autopilot has said that it is one."""
-        return bool(mavlink.autopilots(self._heartbeats.values()))
+        return self._vehicles.autopilot is not None
 
     def latest(self, seconds: float) -> list[Frame]:
         """Frames of the last seconds, a heartbeat of each sender first."""

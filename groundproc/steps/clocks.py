@@ -51,9 +51,14 @@ def work(run: Run, folders: Folders) -> None:
             "system": main.boot.system,
             "component": main.boot.component,
             "boots": len(flight.boots),
+            "vehicles": flight.choice.described(),
+            "notes": list(flight.choice.notes),
             "frames": flight.frames,
             "bad_bytes": flight.bad_bytes,
             "unknown_frames": flight.unknown,
+            "board_logs": flight.board_logs,
+            "board_log_bad_bytes": flight.board_bad_bytes,
+            "board_log_not_finite": flight.board_not_finite,
         },
     }
     path = folders[WHOLE] / FOUND
@@ -87,8 +92,18 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
             "mended": list(leg.utc.mended),
             "warnings": list(leg.utc.doubts),
         },
+        "positions": describe_positions(leg),
+        "from_board_log": leg.boot.origins,
         "sync": describe_sync(leg),
     }
+
+
+def describe_positions(leg: Leg) -> dict[str, Any] | None:
+    """What became of the positions of a leg; None where there are none."""
+    if not ins.has_position(leg.boot):
+        return None
+    fixes = ins.position_fixes(leg.boot, "msl")
+    return {"used": len(fixes.time_ns), "left_out": fixes.left_out, "note": fixes.note}
 
 
 def describe_sync(leg: Leg) -> dict[str, Any]:

@@ -188,3 +188,78 @@ def test_a_message_of_a_single_byte_is_read_and_one_with_two_fields_of_a_name_is
     log = dataflash.parse(own + one + twice + nameless, "x.bin")
     assert {name: table["a"].tolist() for name, table in log.tables.items()} == {"ONE": [7, 8]}
     assert log.bad_bytes == 5 + 5
+
+
+# Pieces, units, real logs ---------------------------------------------------------------------------------------------
+
+
+def tables(log: dataflash.Dataflash) -> dict[str, list[Any]]:
+    return {name: table.tolist() for name, table in log.tables.items()}
+
+
+@given(st.lists(pieces, max_size=12), st.lists(st.integers(1, 400), min_size=1, max_size=20))
+def test_how_a_log_is_cut_into_pieces_and_windows_changes_nothing(parts: list[bytes], sizes: list[int]) -> None:
+    data = FMT + b"".join(parts) + LOG
+    whole = dataflash.parse(data, "a.bin")
+    stretch, window = dataflash._STRETCH, dataflash._WINDOW
+    try:
+        dataflash._STRETCH, dataflash._WINDOW = 150, 3  # type: ignore[misc]
+        parser, start = dataflash.Parser(), 0
+        for size in sizes:
+            parser.feed(data[start : start + size])
+            start += size
+        parser.feed(data[start:])
+        pieced = parser.finish()
+    finally:
+        dataflash._STRETCH, dataflash._WINDOW = stretch, window  # type: ignore[misc]
+    assert repr(tables(pieced)) == repr(tables(whole))
+    assert (pieced.bad_bytes, pieced.counts) == (whole.bad_bytes, whole.counts)
+
+
+def test_what_is_not_wanted_is_counted_and_not_kept() -> None:
+    log = dataflash.parse(LOG, "a.bin", wanted=["GPS"])
+    assert set(log.tables) == {"GPS"}
+    assert log.counts == {"ATT": 2, "GPS": 1, "MSG": 1}
+    assert log.has("GPS", "GWk", "Lat")
+    assert not log.has("GPS", "T")
+    assert not log.has("ATT")
+
+
+def test_units_and_multipliers_are_the_logs_own() -> None:
+    unit = declared(10, "UNIT", "QbZ", "TimeUS,Id,Label")
+    multiplier = declared(11, "MULT", "Qbd", "TimeUS,Id,Mult")
+    of_fields = declared(12, "FMTU", "QBNN", "TimeUS,FmtType,UnitIds,MultIds")
+    field = declared(13, "XYZ", "QcfHhI", "TimeUS,Turn,Rate,Height,Field,Raw")
+    rows = [
+        *(message(10, "QbZ", 0, ord(i), label) for i, label in (("s", b"s"), ("d", b"deg"), ("k", b"deg/s"), ("m", b"m"), ("G", b"Gauss"))),
+        *(message(11, "Qbd", 0, ord(i), float(np.float32(m))) for i, m in (("-", 0.0), ("F", 1e-6), ("B", 1e-2), ("C", 1e-3), ("0", 1.0))),
+        message(12, "QBNN", 0, 13, b"sdkmG-", b"FB0BC-"),
+        message(13, "QcfHhI", 5_000_000, 9000, 90.0, 1234, -450, 7),
+    ]  # fmt: skip
+    log = dataflash.parse(FMT + unit + multiplier + of_fields + field + b"".join(rows), "a.bin")
+    found = {name: float(log.si("XYZ", name)[0]) for name in ("TimeUS", "Turn", "Rate", "Height", "Field", "Raw")}
+    assert found == pytest.approx(
+        {"TimeUS": 5.0, "Turn": np.pi / 2, "Rate": np.pi / 2, "Height": 12.34, "Field": -0.45, "Raw": 7.0}, rel=1e-12
+    )
+    assert log.units["XYZ"]["Rate"] == "deg/s"
+
+
+def test_without_units_hundredths_milliseconds_and_degrees_are_known_by_name() -> None:
+    log = dataflash.parse(LOG, "a.bin")
+    assert log.si("ATT", "TimeUS").tolist() == pytest.approx([1e-3, 2e-3])
+    assert log.si("ATT", "Yaw")[0] == pytest.approx(np.deg2rad(359.99))
+    assert log.si("GPS", "GMS")[0] == pytest.approx(252_408.0)
+    assert log.si("GPS", "Lat")[0] == pytest.approx(37.13054)
+
+
+def test_real_logs_read_as_pymavlink_has_them(recordings: Path, tmp_path: Path) -> None:
+    found = [path for path in sorted((recordings / "mavlink").iterdir()) if path.suffix.lower() == ".bin"]
+    if not found:
+        pytest.skip("no dataflash log among the recordings")
+    for path in found:
+        log = dataflash.parse(path.read_bytes(), path.name)
+        witness = theirs(tmp_path / "a.bin", path.read_bytes())
+        assert log.counts == {name: len(rows) for name, rows in witness.items()}, path.name
+        for name, rows in witness.items():
+            every = max(len(rows) // 200, 1)
+            assert same(log.tables[name][::every], rows[::every]), (path.name, name)

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import mavlink
 from flightlog.mavlink import Frame, FrameParser
+from flightlog.vehicles import Vehicles
 
 TLOGS = ["arducopter313_sim.tlog", "ardusub_2023.tlog", "copter_flight_2015.tlog"]
 
@@ -109,7 +110,10 @@ def test_the_autopilot_is_told_from_ground_stations_and_companions(witness: Witn
         if message.get_type() == "HEARTBEAT"
     }
     assert any(autopilot == 8 for autopilot in senders.values()) or len(senders) == 1
-    assert mavlink.autopilots(known(witness.stream)) == [who for who, what in senders.items() if what != 8]
+    heard = Vehicles()
+    for frame in known(witness.stream):
+        heard.hear(frame)
+    assert heard.vehicles() == [who for who, what in senders.items() if what != 8]
 
 
 # Frames made by pymavlink ---------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def test_the_command_imports_no_science():
 def test_it_writes_all_files_and_says_where(tmp_path, capsys):
     assert run("--scene", "field", "--duration", "1", "-o", tmp_path / "out") == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "capture.pcap", "flight.mcap", "telemetry.tlog", "truth.csv", "truth.json"
+        "board.bin", "capture.pcap", "flight.mcap", "telemetry.tlog", "truth.csv", "truth.json"
     ]  # fmt: skip
     assert "1 s of field, seed 1" in capsys.readouterr().out
 

@@ -22,7 +22,7 @@ def digests(recorded):
 def test_the_number_of_threads_changes_no_byte(simulate):
     one, three = (digests(simulate("village", 1.0, workers=workers, points=True)) for workers in (1, 3))
     assert set(one) == {
-        "flight.mcap", "capture.pcap", "telemetry.tlog", "truth.csv", "truth.json", "truth_points.npy"
+        "flight.mcap", "capture.pcap", "telemetry.tlog", "board.bin", "truth.csv", "truth.json", "truth_points.npy"
     }  # fmt: skip
     assert one == three
 

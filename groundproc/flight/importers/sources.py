@@ -233,13 +233,18 @@ class DataflashLog:
     kind: str = field(default="dataflash", init=False)
     _hash: Any = field(default_factory=hashlib.sha256, init=False)
 
+    @property
+    def pieces(self) -> int:
+        """Messages that it makes."""
+        return -(-self.path.stat().st_size // _DATAFLASH_CHUNK)
+
     def messages(self, start_ns: int) -> Iterator[LogMessage]:
         """The file in pieces, ahead of everything else in the log, which starts at `start_ns` [ns].
 
         The stamps say nothing but the order: one nanosecond from piece to piece.
         """
         topic = records.DATAFLASH.topic + self.link
-        time_ns = start_ns - -(-self.path.stat().st_size // _DATAFLASH_CHUNK)
+        time_ns = start_ns - self.pieces
         with self.path.open("rb") as file:
             while piece := file.read(_DATAFLASH_CHUNK):
                 self._hash.update(piece)

@@ -8,11 +8,12 @@ import numpy.typing as npt
 
 from flightlog import clock, records
 from flightlog.constants import NS_PER_S
-from flightlog.errors import LogError, WrongSensorError
+from flightlog.errors import LogError, SwathError, WrongSensorError
 from flightlog.logfile import LogReader, Message
 from flightlog.mavlink import FrameParser
 from groundproc import sensors
 from groundproc.flight import claims
+from groundproc.flight.flight import read_flight
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import BatchJoiner, DeviceClock, PositionBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
@@ -206,6 +207,9 @@ def summarise(reader: LogReader, progress: Progress | None = None) -> dict[str, 
         summary.add(message)
     summary.finish()
     damage = reader.damage
+    found = summary.result()
+    for link, mavlink in found["mavlink"].items():
+        mavlink["notes"] = _vehicle_notes(reader, link) if len(mavlink["autopilots"]) > 1 else []
     return {
         "file": str(reader.path),
         "bytes": reader.size,
@@ -217,5 +221,13 @@ def summarise(reader: LogReader, progress: Progress | None = None) -> dict[str, 
         "damage": {"bad_chunks": damage.bad_chunks, "lost_bytes": damage.lost_bytes, "places": damage.places},
         "session": reader.metadata.get("swath.session", {}),
         "attachments": sorted(reader.attachments),
-        **summary.result(),
+        **found,
     }
+
+
+def _vehicle_notes(reader: LogReader, link: str) -> list[str]:
+    """Which of several vehicles on a link is taken, by another reading of the log: gyros do not fit in bounded memory."""
+    try:
+        return list(read_flight([reader], link).choice.notes)
+    except SwathError as error:
+        return [f"several vehicles on the link, and no telling which carries the lidar: {error}"]

@@ -6,14 +6,14 @@ from typing import Any, Final
 
 from flightlog import clock
 from flightlog.constants import NS_PER_S
-from flightlog.mavlink import AUTOPILOT_INVALID, Frame, message_id, payload_dtype
+from flightlog.mavlink import Frame, message_id, payload_dtype
+from flightlog.vehicles import Vehicles
 from groundproc.flight.claims import can_be
 
 _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
 """A boot time this much below the last one is a new boot; messages that overtake each other differ by less."""
 _REORDERED: Final = 128
-_HEARTBEAT: Final = message_id("HEARTBEAT")
 _SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
 _GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
 _BOOT_TIMED: Final = tuple(message_id(name) for name in ("SYSTEM_TIME", "ATTITUDE", "GLOBAL_POSITION_INT"))
@@ -43,7 +43,6 @@ class _Boot:
 class _Node:
     """One component of one system."""
 
-    is_autopilot: bool = False
     kinds: dict[int, _Kind] = field(default_factory=dict)
     sequence: int | None = None
     lost: int = 0
@@ -56,6 +55,7 @@ class TelemetrySummary:
 
     frames: int = 0
     nodes: dict[tuple[int, int], _Node] = field(default_factory=dict)
+    vehicles: Vehicles = field(default_factory=Vehicles)
     first_utc_ns: int | None = None
     """The first UTC that the autopilot states and that can be."""
     first_utc_received_ns: int = 0
@@ -77,9 +77,8 @@ class TelemetrySummary:
             skipped = (frame.sequence - node.sequence - 1) % 256
             node.lost += skipped if skipped < _REORDERED else 0
         node.sequence = frame.sequence
-        if frame.message_id == _HEARTBEAT:
-            node.is_autopilot |= _value(frame, "autopilot") != AUTOPILOT_INVALID
-        elif frame.message_id == _GPS_RAW_INT:
+        self.vehicles.hear(frame)
+        if frame.message_id == _GPS_RAW_INT:
             self.fix_type = max(self.fix_type or 0, _value(frame, "fix_type"))
             self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
         if frame.message_id in _BOOT_TIMED:
@@ -96,7 +95,7 @@ class TelemetrySummary:
 
     def result(self, bad_bytes: int, unknown: int) -> dict[str, Any]:
         """The figures; see `swath info --json`."""
-        autopilots = {key: node for key, node in self.nodes.items() if node.is_autopilot}
+        autopilots = {key: self.nodes[key] for key in self.vehicles.vehicles()}
         return {
             "frames": self.frames,
             "unknown_frames": unknown,

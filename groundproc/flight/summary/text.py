@@ -104,6 +104,8 @@ def _mavlink(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
         for boot in autopilot["boots"]:
             since = f"{boot['from_boot_s']:.1f} to {boot['to_boot_s']:.1f} s since boot"
             yield "", f"{boot['from_utc']} to {boot['to_utc']}: {since}"
+    for note in mavlink["notes"]:
+        yield "note", note
     if mavlink["gps_fix_type"] is not None:
         yield "GPS", f"best fix type {mavlink['gps_fix_type']}, {mavlink['gps_satellites']} satellites at most"
     if mavlink["first_system_time_utc"]:

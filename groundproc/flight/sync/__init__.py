@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import SyncError
-from groundproc.flight.sync.correlation import correlate
+from groundproc.flight.sync.correlation import LEAST_PEAK, Peak, best_shift, correlate
 from groundproc.flight.sync.fit import fit
 from groundproc.flight.sync.result import Sync
 from groundproc.flight.sync.tracks import GyroTrack
 
-__all__ = ["GyroTrack", "Sync", "synchronise"]
+__all__ = ["LEAST_PEAK", "GyroTrack", "Peak", "Sync", "best_shift", "synchronise"]
 
 Array = npt.NDArray[np.float64]
 

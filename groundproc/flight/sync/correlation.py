@@ -69,6 +69,21 @@ def correlate(
     SyncError
         Too little motion or overlap, no peak to speak of, or another that is nearly as good.
     """
+    peak = best_shift(lidar, ins, mat_ins_lidar, expected_ns, search_s)
+    _refuse_doubt(peak, f"gyro correlation of {lidar.name} and {ins.name}")
+    return peak
+
+
+def best_shift(
+    lidar: GyroTrack, ins: GyroTrack, mat_ins_lidar: Array | None, expected_ns: int | None, search_s: float
+) -> Peak:
+    """The best of all shifts, however well it fits; see `correlate`.
+
+    Raises
+    ------
+    SyncError
+        Too little motion or overlap.
+    """
     offsets, cross, norm, common = _all_shifts(lidar, ins)
     usable = common >= min(LEAST_OVERLAP_S * ins.rate_hz, 0.9 * common.max())
     if expected_ns is not None:
@@ -82,7 +97,7 @@ def correlate(
     away = np.abs(offsets - offsets[best]) > NS_PER_S
     rival = float(score[away].max()) if away.any() else 0.0
     independent = float(common[best]) * min(1.0, 2.0 * MOTION_HZ / ins.rate_hz)
-    peak = Peak(
+    return Peak(
         int(offsets[best]),
         float(score[best]),
         rival,
@@ -90,8 +105,6 @@ def correlate(
         _rotation(cross[best], mat_ins_lidar),
         (offsets.astype(np.float64), score),
     )
-    _refuse_doubt(peak, f"gyro correlation of {lidar.name} and {ins.name}")
-    return peak
 
 
 def _refuse_doubt(peak: Peak, what: str) -> None:

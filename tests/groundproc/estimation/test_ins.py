@@ -339,3 +339,29 @@ def test_silences_are_not_interpolated_over(frames_of: FramesOf) -> None:
     }
     covered = made.where_covered(np.array([round(t * 1e9) for t in asked]))[1]
     assert covered.tolist() == list(asked.values())
+
+
+@pytest.mark.parametrize("bad", [range(60, 75), range(10)])
+def test_a_glitch_of_400_m_is_left_out_and_said(frames_of: FramesOf, bad: range) -> None:
+    north = 400.0 / 111_369.0
+    messages = [(HOST_NS, heartbeat())]
+    for i in range(150):
+        place = 58.4 + north * (i in bad) + i * 1e-6, 15.6, 60.0
+        messages.append((HOST_NS + i * 200 * MS, position(1_000 + 200 * i, *place, speed=(56, 0, 0))))
+    (boot,) = autopilot.boots(frames_of(messages))
+    fixes = ins.position_fixes(boot, "msl")
+    assert fixes.left_out == len(bad)
+    assert np.ptp(fixes.latitude_deg) < 0.5 * north
+    assert f"{len(bad)} positions of GLOBAL_POSITION_INT left out" in fixes.note
+    assert "by up to 400 m" in fixes.note
+
+
+def test_a_shift_of_400_m_that_lasts_is_kept_and_said(frames_of: FramesOf) -> None:
+    messages = [(HOST_NS, heartbeat())]
+    for i in range(150):
+        place = 58.4 + (i >= 75) * 400.0 / 111_369.0, 15.6, 60.0
+        messages.append((HOST_NS + i * 200 * MS, position(1_000 + 200 * i, *place)))
+    (boot,) = autopilot.boots(frames_of(messages))
+    fixes = ins.position_fixes(boot, "msl")
+    assert (len(fixes.time_ns), fixes.left_out) == (150, 0)
+    assert "shift by 400 m at 15.0 s" in fixes.note

@@ -10,7 +10,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog.errors import LogError
-from flightlog.mavlink import Frame
+from flightlog.mavlink import Frame, FrameParser
 from groundproc.flight import autopilot
 
 TlogFrames = Callable[[str], list[Frame]]
@@ -31,6 +31,17 @@ def attitude(boot_ms: int, roll: float = 0.0) -> Any:
 
 def raw_imu(usec: int, gyro: tuple[int, int, int] = (1, 2, 3)) -> Any:
     return dialect.MAVLink_raw_imu_message(usec, 0, 0, -1000, *gyro, 0, 0, 0)
+
+
+def case_frames(folder: Path) -> list[Frame]:
+    """Frames kept as length and bytes, a second apart."""
+    data, found, parser = (folder / "frames.bin").read_bytes(), [], FrameParser()
+    offset = 0
+    while offset < len(data):
+        size = int.from_bytes(data[offset : offset + 2], "little")
+        found += parser.feed(HOST_NS + len(found) * 1_000 * MS, data[offset + 2 : offset + 2 + size])
+        offset += 2 + size
+    return found
 
 
 def of_pymavlink(recordings: Path, name: str, kind: str) -> list[Any]:
@@ -126,13 +137,33 @@ def test_what_comes_before_the_first_stamp_has_that_stamp(frames_of: FramesOf) -
     assert boot.stamps_ns["RAW_IMU"].tolist() == [70_000 * MS + HALF]
 
 
-def test_of_two_autopilots_the_one_that_says_most_is_taken(frames_of: FramesOf) -> None:
+def test_of_two_autopilots_the_one_heard_first_is_taken_as_aboard(frames_of: FramesOf) -> None:
     quiet = frames_of([(HOST_NS, heartbeat()), (HOST_NS + 5, attitude(1_000, 9.0))], system=1)
     other = frames_of([(HOST_NS, heartbeat())] + [(HOST_NS + i, attitude(50_000 + i)) for i in range(9)], system=2)
     ground = frames_of([(HOST_NS, heartbeat(8))] * 50, system=255)
-    (boot,) = autopilot.boots([*quiet, *ground, *other])
-    assert boot.system == 2
-    assert len(boot.tables["ATTITUDE"]) == 9
+    received = sorted([*quiet, *ground, *other], key=lambda frame: frame.time_ns)
+    first, second = autopilot.vehicles(received)
+    assert (first.addresses, second.addresses) == (((1, 1),), ((2, 1),))
+    assert len(second.boots[0].tables["ATTITUDE"]) == 9
+    (boot,) = autopilot.boots([*quiet, *other])
+    assert boot.system == 1
+
+
+def test_a_ground_station_that_says_generic_is_no_autopilot(cases: Path) -> None:
+    (vehicle,) = autopilot.vehicles(case_frames(cases / "gcs_generic"))
+    assert vehicle.addresses == ((1, 1),)
+
+
+def test_a_system_id_changed_in_flight_is_followed(cases: Path, frames_of: FramesOf) -> None:
+    (vehicle,) = autopilot.vehicles(case_frames(cases / "sysid_changed"))
+    assert vehicle.addresses == ((1, 1), (3, 1))
+    # the boot clock goes on: one boot under two addresses, with nothing lost
+    before = frames_of([(HOST_NS + i * 40 * MS, attitude(1_000 + 40 * i)) for i in range(50)], system=1)
+    after = frames_of([(HOST_NS + i * 40 * MS, attitude(1_000 + 40 * i)) for i in range(50, 100)], system=3)
+    (vehicle,) = autopilot.vehicles([*before, *after])
+    (boot,) = vehicle.boots
+    assert vehicle.name == "1/1, then 3/1"
+    assert len(boot.tables["ATTITUDE"]) == 100
 
 
 def test_without_an_autopilot_there_is_nothing_to_go_by(frames_of: FramesOf) -> None:
