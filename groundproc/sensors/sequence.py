@@ -40,7 +40,7 @@ def after_us(stamps_us: npt.NDArray[np.integer], reference_us: npt.NDArray[np.in
     return np.asarray((stamps_us.astype(np.int64) - reference_us + half) % STAMP_WRAP_US - half)
 
 
-def in_order(
+def sequenced(
     stamps_us: npt.NDArray[np.uint32], packets: npt.NDArray[np.uint8], places: npt.NDArray[np.intp] | None = None
 ) -> Sequence:
     """Sort packets by their stamps and find those that are there twice.

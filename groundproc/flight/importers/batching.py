@@ -18,7 +18,7 @@ from groundproc.flight.importers.joining import Event, LogMessage
 from groundproc.flight.importers.slots import Slot, hand_back, slots
 from groundproc.sensors import velodyne
 from groundproc.sensors.model import Lidar
-from groundproc.sensors.sequence import in_order
+from groundproc.sensors.sequence import sequenced
 
 FIRST_PACKETS: Final = 64
 """Of each sender that are kept to recognise its model by."""
@@ -118,7 +118,7 @@ class Joiner:
         chosen = np.flatnonzero(valid & ours)
         # as bytes: numpy copies records field by field
         plain = data.view(np.uint8).reshape(len(data), hdl32e.DATA_BYTES)
-        found = in_order(data["stamp_us"][chosen], plain, chosen)
+        found = sequenced(data["stamp_us"][chosen], plain, chosen)
         kept = chosen[found.kept]
         self.count.duplicates += found.duplicates
         self.count.reordered += found.moved
@@ -158,7 +158,7 @@ class Joiner:
         ours = np.fromiter((senders is None or event.sender in senders for event in right), np.bool_, len(right))
         chosen = np.flatnonzero(velodyne.is_position(packets) & ours)
         plain = packets.view(np.uint8).reshape(len(packets), hdl32e.POSITION_BYTES)
-        found = in_order(packets["stamp_us"][chosen], plain, chosen)
+        found = sequenced(packets["stamp_us"][chosen], plain, chosen)
         kept = [right[i] for i in chosen[found.kept]]
         self.count.duplicates += found.duplicates
         self.count.reordered += found.moved

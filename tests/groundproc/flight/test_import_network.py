@@ -1,4 +1,4 @@
-"""What networks and captures do to packets: given twice, swapped, of other senders, on other ports, cut, in fragments, behind other links."""
+"""What networks and captures do to packets: given twice, swapped, of strangers, on other ports, cut, in fragments, behind other links."""
 
 import json
 import struct
@@ -18,7 +18,7 @@ from groundproc.cli import main
 from groundproc.flight.importers.fragments import Fragments
 from groundproc.flight.importers.pcap import Packet
 from groundproc.flight.importers.udp import LINK_NAMES, Datagram, DatagramCount, datagrams
-from groundproc.sensors.sequence import in_order
+from groundproc.sensors.sequence import sequenced
 
 START_NS = 1_700_000_000_000_000_000
 Frames = list[tuple[int, bytes]]
@@ -107,7 +107,7 @@ def test_small_captures_that_cannot_be_taken_are_refused_with_the_reason(
 def test_packets_in_any_order_and_number_come_out_sorted_and_once(numbers: list[int], start_us: int) -> None:
     stamps = (np.array(numbers) * 553 + start_us) % hdl32e.STAMP_WRAP_US
     packets = np.array(numbers, "<u2")[:, None].view(np.uint8).reshape(-1, 2)
-    found = in_order(stamps.astype(np.uint32), packets)
+    found = sequenced(stamps.astype(np.uint32), packets)
     assert [numbers[i] for i in found.kept] == sorted(set(numbers))
     assert found.duplicates == len(numbers) - len(set(numbers))
     first = [number for i, number in enumerate(numbers) if number not in numbers[:i]]
@@ -115,13 +115,13 @@ def test_packets_in_any_order_and_number_come_out_sorted_and_once(numbers: list[
 
 
 def test_packets_of_one_stamp_and_other_content_are_two() -> None:
-    found = in_order(np.array([7, 7, 7], np.uint32), np.array([[1], [2], [1]], np.uint8))
+    found = sequenced(np.array([7, 7, 7], np.uint32), np.array([[1], [2], [1]], np.uint8))
     assert (found.kept.tolist(), found.duplicates, found.moved) == ([0, 1], 1, 0)
 
 
 def test_what_lies_before_and_behind_a_step_of_the_clock_is_not_mixed() -> None:
     stamps = np.array([900_000_000, 900_000_553, 1_000, 447, 1_553], np.uint32)
-    found = in_order(stamps, np.arange(5, dtype=np.uint8)[:, None])
+    found = sequenced(stamps, np.arange(5, dtype=np.uint8)[:, None])
     assert (found.kept.tolist(), found.duplicates, found.moved) == ([0, 1, 3, 2, 4], 0, 1)
 
 
