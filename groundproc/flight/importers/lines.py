@@ -72,7 +72,7 @@ def _npz(path: Path) -> tuple[Times, Array, Array, Array, float]:
 
 
 def _csv(path: Path) -> tuple[Times, Array, Array, Array, float]:
-    columns = _columns(path, SCAN_COLUMNS)
+    columns = _columns(path, SCAN_COLUMNS, "lines of a scanner have")
     time_ns = columns[0].astype(np.int64)
     begins = np.flatnonzero(np.diff(time_ns, prepend=time_ns[0] - 1))
     lengths = np.diff(np.append(begins, len(time_ns)))
@@ -93,7 +93,7 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
         The file is not that: a CSV with a head of `IMU_COLUMNS`.
     """
     try:
-        columns = _columns(path, IMU_COLUMNS)
+        columns = _columns(path, IMU_COLUMNS, "an IMU's samples have")
         values = np.stack([column.astype(np.float64) for column in columns[1:]], axis=1)
         time_ns = columns[0].astype(np.int64)
     except (OSError, ValueError, KeyError) as error:
@@ -107,10 +107,10 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
     return time_ns, values[:, :3], values[:, 3:]
 
 
-def _columns(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[np.str_]]:
+def _columns(path: Path, names: tuple[str, ...], what: str) -> list[npt.NDArray[np.str_]]:
     """Columns of a CSV by the names in its head, as text: a time in ns has more digits than a float."""
     with open_text(path) as file:
-        found = table_of(file, str(path), names[0], LogError, f"expected {', '.join(names)}")
+        found = table_of(file, str(path), names[0], LogError, f"{what} {', '.join(names)}")
         missing = [name for name in names if name not in found.names]
         if missing:
             raise KeyError(f"no column {missing[0]}")
