@@ -14,6 +14,7 @@ from typing import Any, Final, TypeVar, cast
 import yaml
 
 from flightlog.errors import ConfigError
+from flightlog.text import decode
 
 T = TypeVar("T")
 
@@ -91,7 +92,7 @@ def load(path: str | Path, cls: type[T]) -> T:
     try:
         with Path(path).open("rb") as file:
             data = file.read(LARGEST_BYTES + 1)
-        text = data.decode("utf-8-sig")
+        text = decode(data)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:

@@ -5,6 +5,7 @@ chunk of points spans, PROJ's own result is fitted by a second-order polynomial 
 """
 
 import math
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -134,15 +135,19 @@ def undulation(geoid: float | str, latitude_deg: float, longitude_deg: float) ->
 def _grid_undulation(path: Path, latitude_deg: float, longitude_deg: float) -> float:
     if not path.is_file():
         raise GeodesyError(f"geoid {path}: is neither a number [m] nor a grid file that is there")
-    pipeline = (
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-        f'+step +inv +proj=vgridshift +grids="{path.resolve()}" +multiplier=1'
-    )
-    try:
-        transformer = pyproj.Transformer.from_pipeline(pipeline)
-        *_, height = transformer.transform(longitude_deg, latitude_deg, 0.0, errcheck=True)
-    except ProjError:
-        height = math.inf
+    # in a pipeline commas part grids and quotes end them; under a plain name any path will do
+    with tempfile.TemporaryDirectory(prefix="swath-geoid-") as folder:
+        plain = Path(folder) / f"geoid{path.suffix if path.suffix[1:].isalnum() else ''}"
+        plain.symlink_to(path.resolve())
+        pipeline = (
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+            f'+step +inv +proj=vgridshift +grids="{plain}" +multiplier=1'
+        )
+        try:
+            transformer = pyproj.Transformer.from_pipeline(pipeline)
+            *_, height = transformer.transform(longitude_deg, latitude_deg, 0.0, errcheck=True)
+        except ProjError:
+            height = math.inf
     if not math.isfinite(height) or abs(height) > LARGEST_UNDULATION_M:
         raise GeodesyError(
             f"geoid {path}: gives no height at {latitude_deg:.4f}, {longitude_deg:.4f}; is it a grid that covers it?"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from flightlog import text as texts
 from flightlog.errors import ConfigError, UsageError
 
 NAME_BYTES: Final = 16
@@ -97,7 +98,7 @@ def as_single(value: float) -> float:
 def load(path: str | Path) -> dict[str, Parameter]:
     """Read a parameter file; ConfigError where it is not one."""
     try:
-        return parse(Path(path).read_text(encoding="utf-8"), str(path))
+        return parse(texts.decode(Path(path).read_bytes()), str(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError
+from flightlog.words import clean
+from groundproc.text import decimal_comma, open_text, table_of
 
 Array = npt.NDArray[np.float64]
 
@@ -70,18 +72,21 @@ def read_control(path: Path) -> tuple[ControlPoint, ...]:
     CaptureError
         It cannot be read, or a line is not what the columns say.
     """
+    found: list[ControlPoint] = []
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        with open_text(path) as file:
+            rows = table_of(file, str(path), "x", CaptureError, f"control has {', '.join(COLUMNS)}")
+            names = [name.lower() for name in rows.names]
+            if not set(COLUMNS) <= set(names):
+                missing = ", ".join(name for name in COLUMNS if name not in names)
+                raise CaptureError(f"{path}: the first line has no column {missing}")
+            for number, line in rows.rows(short=True):
+                words = dict(zip(names, (word.strip() for word in line), strict=False))
+                comma = decimal_comma(line)
+                place = f"{path}: line {number}: " + (comma or f"{clean(','.join(line))!r} found")
+                found.append(_point(words, place, len(found) + 1))
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
-    names = [word.strip().lower() for word in lines[0].lstrip("\ufeff").split(",")] if lines else []
-    if not set(COLUMNS) <= set(names):
-        raise CaptureError(f"{path}: the first line has no column {', '.join(n for n in COLUMNS if n not in names)}")
-    found: list[ControlPoint] = []
-    for number, line in enumerate(lines[1:], 2):
-        if line.strip():
-            words = dict(zip(names, (word.strip() for word in line.split(",")), strict=False))
-            found.append(_point(words, f"{path}: line {number}: {line.strip()!r} found", len(found) + 1))
     if not found:
         raise CaptureError(f"{path}: holds no points")
     return tuple(found)

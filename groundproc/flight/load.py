@@ -19,6 +19,7 @@ from flightlog.records import LidarAccount
 from groundproc.flight.lidar import lidar_of
 from groundproc.sensors import velodyne
 from groundproc.sensors.model import Lidar, Readings
+from groundproc.sensors.sequence import sequenced
 
 Progress = Callable[[int], None]
 
@@ -45,6 +46,8 @@ class LidarBatch:
         What became of the packets; None where the log does not say.
     jumped : bool
         Either clock was set since the batch before: times before and after do not compare.
+    duplicates, moved : int
+        Packets that were there twice and left out, and that stood behind later ones and were put in their place.
     """
 
     log_time_ns: int
@@ -53,6 +56,8 @@ class LidarBatch:
     device_time_ns: npt.NDArray[np.int64]
     account: LidarAccount | None
     jumped: bool = False
+    duplicates: int = 0
+    moved: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +212,25 @@ class BatchJoiner:
         if not len(packets):
             nothing = np.empty(0, np.int64)
             return [LidarBatch(self._log_time_ns, packets, nothing, nothing, account)]
+        found = None
+        if self._lidar.stamp_wraps:
+            plain = packets.view(np.uint8).reshape(len(packets), -1)
+            found = sequenced(stamps_of(self._lidar, packets), _contents(packets, plain))
+            if found.duplicates or found.moved:
+                packets = plain[found.kept].reshape(-1).view(packets.dtype)
         receive_ns = self._lidar.receive_time_ns(packets)
-        if not self._lidar.stamp_wraps:
+        if found is None:
             return [LidarBatch(self._log_time_ns, packets, receive_ns, self._lidar.stamp_ns(packets), account)]
         device_ns, jumped = self.device.extend(stamps_of(self._lidar, packets), receive_ns)
-        return [LidarBatch(self._log_time_ns, packets, receive_ns, device_ns, account, jumped)]
+        mended = (found.duplicates, found.moved)
+        return [LidarBatch(self._log_time_ns, packets, receive_ns, device_ns, account, jumped, *mended)]
+
+
+def _contents(packets: npt.NDArray[np.void], plain: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """The bytes of packets without their times of reception, shape (n, bytes)."""
+    assert packets.dtype.fields is not None
+    kind, start = packets.dtype.fields["data"][:2]
+    return plain[:, start : start + kind.itemsize]
 
 
 def joined(parts: Sequence[npt.NDArray[np.void]]) -> npt.NDArray[np.void]:

@@ -130,7 +130,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         config.load(tmp_path / "none.yaml", Recorder)
     with pytest.raises(ConfigError, match=r"cannot be read \(Is a directory\)$"):
         config.load(tmp_path, Recorder)
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "binary.yaml").write_bytes(b"\x80\xff\x00\x81")
     with pytest.raises(ConfigError, match=r"binary\.yaml: is not a text file$"):
         config.load(tmp_path / "binary.yaml", Recorder)
 

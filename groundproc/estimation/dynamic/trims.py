@@ -14,6 +14,7 @@ from flightlog import frames
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from groundproc.estimation.dynamic.search import VARIABLES, Found
+from groundproc.text import decimal_comma, open_text, table_of
 from groundproc.trajectory.table import from_poses
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -114,10 +115,12 @@ def read_yaw(path: Path) -> tuple[Times, Array, Array]:
         It cannot be read, or is not such a table.
     """
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            names = file.readline().strip().split(",")
-            places = [names.index(name) for name in ("utc_ns", "heading_deg", "yaw_deg")]
-            rows = [line.strip().split(",") for line in file if line.strip()]
+        with open_text(path) as file:
+            trims = table_of(file, str(path), "utc_ns", LogError, f"expected {', '.join(COLUMNS[:3])}")
+            places = [trims.names.index(name) for name in ("utc_ns", "heading_deg", "yaw_deg")]
+            rows = [words for _, words in trims.rows()]
+        if rows and (comma := decimal_comma(rows[0])):
+            raise LogError(f"{path}: {comma}")
         time_ns = np.array([int(row[places[0]]) for row in rows], np.int64)
         angles = np.array([[float(row[place]) for place in places[1:]] for row in rows]).reshape(-1, 2)
     except OSError as error:

@@ -3,27 +3,58 @@
 import heapq
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 
 from flightlog import __version__
-from flightlog.clock import utc_text
-from flightlog.errors import CaptureError, LogError, UsageError, WrongSensorError
+from flightlog.errors import LogError, UsageError
 from flightlog.logfile import LogWriter
-from groundproc import sensors
-from groundproc.flight.importers.joining import Event, Joiner, LogMessage
-from groundproc.flight.importers.sources import Capture, DataflashLog, Ports, Source, Tlog, open_mavlink
+from groundproc.flight.importers import outcome
+from groundproc.flight.importers.batching import Joiner
+from groundproc.flight.importers.joining import Event, LogMessage
+from groundproc.flight.importers.ports import Ports
+from groundproc.flight.importers.senders import Probed, Senders, address_of
+from groundproc.flight.importers.sources import Capture, DataflashLog, Source, Timed, Tlog, open_mavlink
 from groundproc.flight.importers.starting import moves
 from groundproc.flight.lidar import STATED
-from groundproc.sensors.model import Lidar
+
+if TYPE_CHECKING:
+    from groundproc.flight.importers.bag import Bag
+
+S = TypeVar("S", bound=Source)
 
 LINK = "ins"
 """The autopilot that measures: what these recordings are of."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recordings:
+    """What is imported.
+
+    Attributes
+    ----------
+    captures : sequence of Path
+        pcap or pcapng files, in any order.
+    mavlink : sequence of Path
+        Telemetry logs and dataflash logs.
+    bags : sequence of Path
+        ROS 1 bags, ROS 2 bags (folder, db3, MCAP).
+    """
+
+    captures: Sequence[Path] = ()
+    mavlink: Sequence[Path] = ()
+    bags: Sequence[Path] = ()
+
+    @property
+    def paths(self) -> list[Path]:
+        """All of them."""
+        return [*self.captures, *self.mavlink, *self.bags]
 
 
 @dataclass(slots=True)
@@ -33,33 +64,35 @@ class Imported:
     lidar_packets: int = 0
     position_packets: int = 0
     mavlink_frames: int = 0
+    dataflash_bytes: int = 0
     messages: int = 0
     notes: list[str] = field(default_factory=list)
     sources: list[dict[str, Any]] = field(default_factory=list)
 
 
 def import_flight(
-    captures: Sequence[Path],
-    mavlink: Sequence[Path],
+    recordings: Recordings,
     output: Path,
     *,
     ports: Ports,
     attachments: dict[str, bytes],
+    sender: str = "",
     force: bool = False,
     progress: Callable[[int], object] | None = None,
 ) -> Imported:
-    """Make a flight log of captures and recordings of the autopilot.
+    """Make a flight log of recordings of other programs.
 
     Parameters
     ----------
-    captures, mavlink : sequence of Path
-        pcap or pcapng files, in any order; telemetry logs and dataflash logs.
+    recordings : Recordings
     output : Path
         The log to write; it appears when it is whole.
     ports : Ports
         Where the lidar sent to.
     attachments : dict of name to bytes
         What makes the log stand alone, such as the mount.
+    sender : str
+        Address of the lidar, or its topic in a bag; empty: the one that sent most packets.
     force : bool
         Replace an existing output.
     progress : callable, optional
@@ -68,36 +101,31 @@ def import_flight(
     Raises
     ------
     CaptureError
-        An input that is not what it should be, or no packet of the lidar in any of them.
+        An input that is not what it should be, or nothing of a lidar or an autopilot in any of them.
+    WrongSensorError
+        The lidar is of a model that is not known, or captures are of different ones.
     UsageError
         The output exists, or an input is given twice.
     LogError
         The output cannot be written.
     """
-    _refuse_repetition([*captures, *mavlink], output)
+    _refuse_repetition(recordings.paths, output)
     if output.exists() and not force:
         raise UsageError(f"{output}: exists already; give another name, or --force to replace it")
-    sources: list[Source] = []
+    senders = Senders(address_of(sender) if sender else b"")
+    partial = output.with_name(f".{output.name}.partial")
     try:
-        for path in captures:
-            sources.append(Capture(path, ports))
-        for path in mavlink:
-            sources.append(open_mavlink(path, LINK))
-        partial = output.with_name(f".{output.name}.partial")
-        try:
-            with partial.open("wb") as stream:
-                result = _write(stream, sources, attachments, progress)
-                stream.flush()
-                os.fsync(stream.fileno())
-            partial.replace(output)
-        except OSError as error:
-            raise LogError(f"{output}: cannot be written ({error.strerror})") from None
-        finally:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".swath-import-", dir=output.parent) as unpacked:
+            while True:
+                result = _attempt(recordings, partial, Path(unpacked), ports, attachments, senders, progress)
+                if result is not None:
+                    break
+        partial.replace(output)
+    except OSError as error:
+        raise LogError(f"{output}: cannot be written ({error.strerror})") from None
     finally:
-        for source in sources:
-            source.close()
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
     return result
 
 
@@ -111,44 +139,80 @@ def _refuse_repetition(paths: list[Path], output: Path) -> None:
         raise UsageError(f"{output}: is an input and cannot be the output too")
 
 
+def _attempt(
+    recordings: Recordings,
+    partial: Path,
+    unpacked: Path,
+    ports: Ports,
+    attachments: dict[str, bytes],
+    senders: Senders,
+    progress: Callable[[int], object] | None,
+) -> Imported | None:
+    """Read and write all of it; None where another sender than the one thought turns out to be the lidar."""
+    with ExitStack() as opened:
+
+        def taken(source: S) -> S:
+            opened.callback(source.close)
+            return source
+
+        logs = [taken(open_mavlink(path, LINK, unpacked)) for path in recordings.mavlink]
+        takes_mavlink = "mavlink" in ports.given or not any(isinstance(log, Tlog) for log in logs)
+        captures = [taken(Capture(path, ports, LINK, takes_mavlink=takes_mavlink)) for path in recordings.captures]
+        bags = [taken(_bag(path, unpacked)) for path in recordings.bags]
+        probed: list[Probed] = [*captures, *bags]
+        with partial.open("wb") as stream:
+            result = _write(stream, probed, [*captures, *logs, *bags], ports, attachments, senders, progress)
+            stream.flush()
+            os.fsync(stream.fileno())
+    return result
+
+
+def _bag(path: Path, folder: Path) -> "Bag":
+    from groundproc.flight.importers.bag import Bag  # rosbags takes as long to load as all the rest
+
+    return Bag(path, LINK, folder)
+
+
 def _write(
     stream: BinaryIO,
+    probed: Sequence[Probed],
     sources: Sequence[Source],
+    ports: Ports,
     attachments: dict[str, bytes],
+    senders: Senders,
     progress: Callable[[int], object] | None,
-) -> Imported:
-    timed = [source for source in sources if isinstance(source, (Capture, Tlog))]
+) -> Imported | None:
+    lidar = senders.lidar(probed)
+    timed = [cast(Timed, source) for source in sources if not isinstance(source, DataflashLog)]
     for source, moved_ns in zip(timed, moves([source.start() for source in timed]), strict=True):
         source.steady.begin(moved_ns)
-    events = heapq.merge(*(source.events() for source in timed), key=attrgetter("time_ns"))
+    events = heapq.merge(*(source.events() for source in sources), key=attrgetter("time_ns"))
     first = next(events, None)
-    lidar_model = _lidar(sources)
-    joiner = Joiner(lidar_model)
-    session = {"origin": "import", "version": __version__, STATED[1]: lidar_model.name}
+    joiner = Joiner(lidar, senders.chosen)
+    session = {"origin": "import", "version": __version__}
+    if senders.chosen:
+        session[STATED[1]] = lidar.name
     writer = LogWriter(
         stream, metadata={"swath.session": session}, attachments=attachments, library=f"swath {__version__}"
     )
     result = Imported()
-    if first is not None:
-        flashes = board_logs([s for s in sources if isinstance(s, DataflashLog)], first.time_ns)
-        following = joiner.messages(_counted(chain([first], events), progress))
-        for message in chain(flashes, following):
-            writer.write(*message)
-            result.messages += 1
-    _check(joiner, sources)
-    lidar = joiner.count.lidar
+    flashes = [source for source in sources if isinstance(source, DataflashLog)]
+    for message in _messages(flashes, joiner, first, events, progress):
+        writer.write(*message)
+        result.messages += 1
+    if not senders.settled(joiner):
+        return None
+    outcome.check(joiner, sources, ports)
     result.sources = [source.facts() for source in sources]
     result.notes = [note for source in sources for note in source.notes()]
-    result.notes += _packet_notes(joiner) + _overlap_notes(sources)
-    result.lidar_packets = lidar.kept
+    result.notes += outcome.notes(joiner, sources, ports)
+    result.lidar_packets = joiner.count.lidar.kept
     result.position_packets = joiner.count.position_received - joiner.count.position_rejected
-    result.mavlink_frames = sum(s.count.frames for s in sources if isinstance(s, Tlog))
-    counters = {
-        "lidar": {name: value for name, value in asdict(lidar).items() if not name.startswith("fov")},
-        "position_received": joiner.count.position_received,
-        "position_rejected": joiner.count.position_rejected,
-    }
-    session |= {"sources": json.dumps(result.sources), "counters": json.dumps(counters)}
+    result.mavlink_frames = sum(source.mavlink_frames for source in sources)
+    result.dataflash_bytes = sum(flash.content.stat().st_size for flash in flashes)
+    if result.lidar_packets:
+        session[STATED[1]] = lidar.name
+    session |= {"sources": json.dumps(result.sources), "counters": json.dumps(outcome.counters(joiner))}
     writer.add_metadata("swath.session", session)
     writer.finish()
     return result
@@ -162,20 +226,18 @@ def board_logs(logs: Sequence[DataflashLog], start_ns: int) -> Iterator[LogMessa
         yield from log.messages(start_ns)
 
 
-def _lidar(sources: Sequence[Source]) -> Lidar:
-    """The lidar of all captures; the flown model where none of them tells.
-
-    Raises
-    ------
-    WrongSensorError
-        They are of different ones.
-    """
-    told = {s.lidar.name: s for s in sources if isinstance(s, Capture) and s.lidar is not None}
-    if len(told) > 1:
-        raise WrongSensorError(
-            "; ".join(f"{source.path}: is of a {name}" for name, source in told.items()) + "; one flight has one lidar"
-        )
-    return sensors.lidar(next(iter(told), sensors.FLOWN))
+def _messages(
+    flashes: Sequence[DataflashLog],
+    joiner: Joiner,
+    first: Event | None,
+    events: Iterator[Event],
+    progress: Callable[[int], object] | None,
+) -> Iterator[LogMessage]:
+    """All messages of the log, dataflash logs ahead; alone they begin at the time of their file, for want of a better one."""
+    start_ns = first.time_ns if first is not None else min((flash.written_ns for flash in flashes), default=0)
+    yield from board_logs(flashes, start_ns)
+    if first is not None:
+        yield from joiner.messages(_counted(chain([first], events), progress))
 
 
 def _counted(events: Iterator[Event], progress: Callable[[int], object] | None) -> Iterator[Event]:
@@ -185,48 +247,3 @@ def _counted(events: Iterator[Event], progress: Callable[[int], object] | None) 
     for event in events:
         progress(len(event.data))
         yield event
-
-
-def _check(joiner: Joiner, sources: Sequence[Source]) -> None:
-    """Refuse an import that found no packet of the lidar, with the likeliest reason."""
-    lidar = joiner.count.lidar
-    if lidar.kept or joiner.count.position_received > joiner.count.position_rejected:
-        return
-    captures = [source for source in sources if isinstance(source, Capture)]
-    names = ", ".join(str(capture.path) for capture in captures)
-    damage = "; ".join(f"it {capture.found.damage}" for capture in captures if capture.found.damage)
-    ports = {port for capture in captures for port, size in capture.other_ports.items() if size > 1000}
-    if lidar.received:
-        reason = f"{lidar.received} packets came to its port, none of them a {joiner.lidar.name}'s"
-    elif ports:
-        reason = f"packets of the right size went to UDP port {min(ports)}: try --lidar-port {min(ports)}"
-    else:
-        reason = damage or f"{sum(c.found.packets for c in captures)} packets seen, none to the lidar's UDP port"
-    raise CaptureError(f"{names}: holds no packet of a lidar ({reason})")
-
-
-def _overlap_notes(sources: Sequence[Source]) -> list[str]:
-    """Say which telemetry was not recorded while the lidar was: two flights, or two computers' clocks."""
-    captures = [s.steady for s in sources if isinstance(s, Capture) and s.steady.first_ns is not None]
-    start_ns = min((steady.first_ns or 0 for steady in captures), default=0)
-    end_ns = max((steady.last_ns for steady in captures), default=0)
-    return [
-        f"{s.path}: lies wholly before or after the lidar packets ({utc_text(s.steady.first_ns)} to "
-        f"{utc_text(s.steady.last_ns)}; these {utc_text(start_ns)} to {utc_text(end_ns)})"
-        for s in sources
-        if isinstance(s, Tlog) and s.steady.first_ns is not None
-        if s.steady.last_ns < start_ns or s.steady.first_ns > end_ns
-    ]
-
-
-def _packet_notes(joiner: Joiner) -> list[str]:
-    lidar, notes = joiner.count.lidar, []
-    if not lidar.kept:
-        notes.append("no lidar data packet was found, position packets only")
-    for name in ("rejected_length", "rejected_content", "rejected_sender"):
-        if count := getattr(lidar, name):
-            what = {"rejected_length": "of a wrong length", "rejected_content": f"that are no {joiner.lidar.name}'s"}
-            notes.append(f"{count} packets {what.get(name, 'of a second sender')} on the lidar's port left out")
-    if joiner.count.position_rejected:
-        notes.append(f"{joiner.count.position_rejected} packets on the position port left out")
-    return notes

@@ -1,5 +1,6 @@
 """Files of a line scanner's kit: lines of ranges (CSV or NPZ), and samples of an IMU (CSV)."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -8,6 +9,7 @@ import numpy.typing as npt
 
 from flightlog.errors import LogError
 from flightlog.records import line_dtype
+from groundproc.text import decimal_comma, open_text, table_of
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -70,7 +72,7 @@ def _npz(path: Path) -> tuple[Times, Array, Array, Array, float]:
 
 
 def _csv(path: Path) -> tuple[Times, Array, Array, Array, float]:
-    columns = _columns(path, SCAN_COLUMNS)
+    columns = _columns(path, SCAN_COLUMNS, "lines of a scanner have")
     time_ns = columns[0].astype(np.int64)
     begins = np.flatnonzero(np.diff(time_ns, prepend=time_ns[0] - 1))
     lengths = np.diff(np.append(begins, len(time_ns)))
@@ -91,7 +93,7 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
         The file is not that: a CSV with a head of `IMU_COLUMNS`.
     """
     try:
-        columns = _columns(path, IMU_COLUMNS)
+        columns = _columns(path, IMU_COLUMNS, "an IMU's samples have")
         values = np.stack([column.astype(np.float64) for column in columns[1:]], axis=1)
         time_ns = columns[0].astype(np.int64)
     except (OSError, ValueError, KeyError) as error:
@@ -105,14 +107,21 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
     return time_ns, values[:, :3], values[:, 3:]
 
 
-def _columns(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[np.str_]]:
+def _columns(path: Path, names: tuple[str, ...], what: str) -> list[npt.NDArray[np.str_]]:
     """Columns of a CSV by the names in its head, as text: a time in ns has more digits than a float."""
-    with path.open(encoding="utf-8") as file:
-        head = [name.strip() for name in file.readline().split(",")]
-        missing = [name for name in names if name not in head]
+    with open_text(path) as file:
+        found = table_of(file, str(path), names[0], LogError, f"{what} {', '.join(names)}")
+        missing = [name for name in names if name not in found.names]
         if missing:
             raise KeyError(f"no column {missing[0]}")
-        table = np.loadtxt(file, delimiter=",", dtype=np.str_, ndmin=2, usecols=[head.index(name) for name in names])
-    if not len(table):
+        places = [found.names.index(name) for name in names]
+        first = file.readline()
+        for _, words in found.of([first]):  # of the first row only: there may be millions
+            if comma := decimal_comma(words):
+                raise ValueError(comma)
+        values = np.loadtxt(
+            chain([first], file), delimiter=found.separator, dtype=np.str_, ndmin=2, usecols=places, quotechar='"'
+        )
+    if not len(values):
         raise ValueError("no rows")
-    return list(table.T)
+    return list(values.T)

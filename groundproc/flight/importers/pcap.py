@@ -10,6 +10,7 @@ from typing import BinaryIO, Final, NamedTuple
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
+from groundproc.flight.importers.kinds import HEAD_BYTES, kind_of
 
 _CLASSIC: Final = {
     b"\xd4\xc3\xb2\xa1": ("<", 1000),
@@ -91,7 +92,10 @@ def packets(stream: BinaryIO, count: CaptureCount, place: str) -> Iterator[Packe
     elif not magic:
         raise CaptureError(f"{place}: is empty, expected a pcap or pcapng capture")
     else:
-        raise CaptureError(f"{place}: is no pcap or pcapng capture (it starts with the bytes {magic.hex(' ')})")
+        kind = kind_of(magic + stream.read(HEAD_BYTES))
+        if kind.what.startswith("nothing"):
+            raise CaptureError(f"{place}: is no pcap or pcapng capture (it starts with the bytes {magic.hex(' ')})")
+        raise CaptureError(f"{place}: is no pcap or pcapng capture but {kind.what}; {kind.remedy}")
 
 
 def _torn(stream: BinaryIO, count: CaptureCount, start: bytes, what: str) -> None:

@@ -1,68 +1,29 @@
 """The files that an import takes: each opened, recognised by its content, and read once as a stream of events."""
 
-import hashlib
-import io
 import mmap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Protocol, cast
+from typing import Any, Final, Protocol
 
-import numpy as np
-
-from flightlog import dataflash, hdl32e, records
+from flightlog import hdl32e, records
 from flightlog.errors import CaptureError
-from groundproc import sensors
+from groundproc import packed
 from groundproc.flight.importers import pcap, tlog, udp
+from groundproc.flight.importers.inputs import Input, hash_of
 from groundproc.flight.importers.joining import Event, LogMessage
+from groundproc.flight.importers.kinds import DATAFLASH, HEAD_BYTES, TLOG, Kind, kind_of
+from groundproc.flight.importers.mavlinkstreams import MavlinkStreams
 from groundproc.flight.importers.mended import mended
+from groundproc.flight.importers.ports import Elsewhere, Ports
 from groundproc.flight.importers.starting import Start, start_of
 from groundproc.flight.importers.steady import Steady
-from groundproc.flight.lidar import recognised
-from groundproc.sensors.model import Lidar
 
-_PROBE_PACKETS: Final = 64
-_PROBE_DATAGRAMS: Final = 2000
+PROBE_PACKETS: Final = 64
+"""Data packets that tell a model."""
+_PROBE_EVENTS: Final = 2000
 _DATAFLASH_CHUNK: Final = 1 << 16
-
-
-class Hashed(io.RawIOBase):
-    """A file that hashes what is read from it.
-
-    Attributes
-    ----------
-    size : int
-        Bytes read so far.
-    """
-
-    def __init__(self, path: Path) -> None:
-        try:
-            self._file = path.open("rb", buffering=0)
-        except OSError as error:
-            raise CaptureError(f"{path}: cannot be opened ({error.strerror})") from None
-        self._hash = hashlib.sha256()
-        self.size = 0
-
-    def readable(self) -> bool:
-        """It can be read."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        """Read, hash and count."""
-        count = self._file.readinto(buffer) or 0
-        self._hash.update(memoryview(buffer)[:count])
-        self.size += count
-        return count
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
-
-    def sha256(self) -> str:
-        """Hash of what was read, in hexadecimal."""
-        return self._hash.hexdigest()
 
 
 class Source(Protocol):
@@ -70,6 +31,13 @@ class Source(Protocol):
 
     path: Path
     kind: str
+
+    @property
+    def mavlink_frames(self) -> int:
+        """Good MAVLink frames taken of it."""
+
+    def events(self) -> Iterator[Event]:
+        """What was received, each thing with its time, which never steps back."""
 
     def facts(self) -> dict[str, Any]:
         """What it was and what was found in it, for the log's metadata; complete once it has been read."""
@@ -81,116 +49,188 @@ class Source(Protocol):
         """Close the file."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ports:
-    """UDP destination ports of the lidar."""
+class Timed(Source, Protocol):
+    """A recording whose stamps are times of reception."""
 
-    lidar: int = hdl32e.DATA_PORT
-    position: int = hdl32e.POSITION_PORT
+    steady: Steady
+
+    def start(self) -> Start | None:
+        """What the first stamps say; None where there are none."""
 
 
 class Capture:
     """A pcap or pcapng file.
 
+    Parameters
+    ----------
+    path : Path
+    ports : Ports
+    link : str
+        Name of the autopilot's link whose frames are taken.
+    takes_mavlink : bool
+        False: MAVLink in it is counted and left out.
+
+    Attributes
+    ----------
+    first_packets : dict of bytes to list of bytes
+        The first data packets, by their sender.
+    elsewhere : Elsewhere
+
     Raises
     ------
     CaptureError
-        No such file, or no capture.
-    WrongSensorError
-        The capture of another lidar.
+        No such file, no capture, or one of a link layer that is not read.
     """
 
     kind = "capture"
-    lidar: Lidar | None
-    """The model of its packets; None where it holds no data packet, or none that tells."""
 
-    def __init__(self, path: Path, ports: Ports) -> None:
+    def __init__(self, path: Path, ports: Ports, link: str, *, takes_mavlink: bool = True) -> None:
         self.path = path
         self.found = pcap.CaptureCount()
         self.datagrams = udp.DatagramCount()
         self.steady = Steady()
-        self._ports = ports
-        self.other_ports: dict[int, int] = {}
-        self._hashed = Hashed(path)
-        stream = cast(BinaryIO, io.BufferedReader(self._hashed, 1 << 20))
+        self.mavlink = MavlinkStreams(records.MAVLINK.topic + link)
+        self.elsewhere = Elsewhere()
+        self.first_packets: dict[bytes, list[bytes]] = {}
+        self.mavlink_left_out = 0
+        self._ports, self._link, self._takes_mavlink = ports, link, takes_mavlink
+        self._input = Input(path)
         try:
-            packets = pcap.packets(stream, self.found, str(path))
-            self._stream = udp.datagrams(packets, self.datagrams)
+            self._stream = self._sorted_out(pcap.packets(self._input.stream, self.found, str(path)))
             self._head = self._probe()
         except OSError as error:
             raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
 
-    def _probe(self) -> list[udp.Datagram]:
-        """Take the first datagrams, and recognise the sensor by them."""
-        head: list[udp.Datagram] = []
-        lidar: list[bytes] = []
-        for datagram in self._stream:
-            head.append(datagram)
-            if datagram.port == self._ports.lidar and len(datagram.payload) == hdl32e.DATA_BYTES:
-                lidar.append(datagram.payload)
-            if len(lidar) >= _PROBE_PACKETS or len(head) >= _PROBE_DATAGRAMS:
-                break
-        packets = np.frombuffer(b"".join(lidar), hdl32e.DATA_DTYPE)
-        self.lidar = recognised(sensors.of_topic(records.LIDAR.topic), packets, str(self.path)) if lidar else None
-        return head
-
-    def events(self) -> Iterator[Event]:
-        """The packets of the lidar in the order in which they were sent, with times that never step back."""
-        return self.steady(self._as_stamped(chain(self._head, self._stream)))
-
-    def start(self) -> Start | None:
-        """What the first stamps say; the file is opened once more for it."""
-        return start_of(self._again)
-
-    def _again(self) -> Iterator[Event]:
-        with self.path.open("rb", buffering=1 << 20) as file:
-            packets = pcap.packets(file, pcap.CaptureCount(), str(self.path))
-            yield from self._as_stamped(udp.datagrams(packets, udp.DatagramCount()))
-
-    def _as_stamped(self, datagrams: Iterable[udp.Datagram]) -> Iterator[Event]:
+    def _sorted_out(self, packets: Iterator[pcap.Packet]) -> Iterator[Event]:
+        """What the capture holds of lidar and autopilot, with the times of the capture; the rest is counted."""
         topics = {self._ports.lidar: records.LIDAR.topic, self._ports.position: records.POSITION.topic}
-        for datagram in datagrams:
+        mavlink = frozenset(self._ports.mavlink)
+        for datagram in udp.datagrams(packets, self.datagrams):
             topic = topics.get(datagram.port)
             if topic is not None:
                 yield Event(datagram.time_ns, topic, datagram.payload, datagram.sender)
-            elif len(datagram.payload) in (hdl32e.DATA_BYTES, hdl32e.POSITION_BYTES):
-                self.other_ports[datagram.port] = len(datagram.payload)
+            elif datagram.port in mavlink or datagram.source_port in mavlink:
+                if self._takes_mavlink:
+                    yield from self.mavlink.feed(datagram)
+                else:
+                    self.mavlink_left_out += 1
+            else:
+                self.elsewhere.add(datagram.port, datagram.payload)
+        yield from self.mavlink.finish()
+        self._check_links()
+
+    def _check_links(self) -> None:
+        """Refuse a capture of which nothing can be read, with the reason."""
+        if self.datagrams.datagrams:
+            return
+        if self.datagrams.links:
+            raise CaptureError(
+                f"{self.path}: {_link_names(self.datagrams.links)}; expected Ethernet, Linux cooked, loopback or raw IP: capture on "
+                "the interface of the lidar"
+            )
+        if self.datagrams.cut:
+            raise CaptureError(f"{self.path}: {snap_text(self.datagrams)}")
+
+    def _probe(self) -> list[Event]:
+        """Take the first events, among them enough packets of the lidar to tell which model it is."""
+        head: list[Event] = []
+        count = 0
+        for event in self._stream:
+            head.append(event)
+            if event.topic == records.LIDAR.topic and len(event.data) == hdl32e.DATA_BYTES:
+                self.first_packets.setdefault(event.sender, []).append(event.data)
+                count += 1
+            if count >= PROBE_PACKETS or len(head) >= _PROBE_EVENTS:
+                break
+        return head
+
+    def events(self) -> Iterator[Event]:
+        """What was received from lidar and autopilot, in the order in which it was sent, with times that never step back."""
+        return self.steady(self._as_stamped())
+
+    def start(self) -> Start | None:
+        """What the first stamps say; a file is opened once more for it, of a pipe what was read already has to do."""
+        if not self.path.is_file():
+            return start_of(lambda: self._head)
+        again = Capture(self.path, self._ports, self._link, takes_mavlink=self._takes_mavlink)
+        try:
+            return start_of(again._as_stamped)
+        finally:
+            again.close()
+
+    def _as_stamped(self) -> Iterator[Event]:
+        return chain(self._head, self._stream)
+
+    @property
+    def mavlink_frames(self) -> int:
+        """See Source."""
+        return self.mavlink.frames
 
     def facts(self) -> dict[str, Any]:
         """See Source."""
-        counters = asdict(self.found) | asdict(self.datagrams) | asdict(self.steady)
-        return _facts(self, self._hashed.size, self._hashed.sha256(), counters)
+        datagrams = {name: value for name, value in asdict(self.datagrams).items() if name != "links"}
+        links = {f"link_type_{link}": count for link, count in self.datagrams.links.items()}
+        mavlink = {"mavlink_frames": self.mavlink.frames, "mavlink_bad_bytes": self.mavlink.bad_bytes}
+        counters = asdict(self.found) | datagrams | links | mavlink | asdict(self.steady)
+        sha256 = self._input.sha256()
+        return facts_of(self, self._input.size, sha256, counters)
 
     def notes(self) -> list[str]:
         """See Source."""
         notes = []
+        if self._input.damage:
+            notes.append(f"{self.path}: {self._input.damage}")
         if self.found.damage:
             notes.append(f"{self.path}: {self.found.damage}, {self.found.lost_bytes} bytes left out")
+        if self.datagrams.links:
+            notes.append(f"{self.path}: {_link_names(self.datagrams.links)} left out")
         if self.datagrams.cut:
-            notes.append(f"{self.path}: {self.datagrams.cut} packets were captured only in part and left out")
+            notes.append(f"{self.path}: {snap_text(self.datagrams)}; left out")
         if self.datagrams.fragments:
-            notes.append(f"{self.path}: {self.datagrams.fragments} IP fragments left out")
+            notes.append(f"{self.path}: {self.datagrams.fragments} IP fragments whose others are missing left out")
         if self.found.untimed or self.found.borrowed_times:
             count = self.found.untimed + self.found.borrowed_times
             notes.append(f"{self.path}: {count} packets carry no time of their own")
+        if self.mavlink.bad_bytes:
+            notes.append(f"{self.path}: {self.mavlink.bad_bytes} bytes on the MAVLink ports belong to no good frame")
+        if self.mavlink_left_out:
+            notes.append(
+                f"{self.path}: {self.mavlink_left_out} datagrams on the MAVLink ports left out, because --mavlink gives a telemetry "
+                "log; --mavlink-port takes them too"
+            )
         return notes + [f"{self.path}: {said}" for said in mended(self.steady)]
 
     def close(self) -> None:
         """See Source."""
-        self._hashed.close()
+        self._input.close()
+
+
+def _link_names(links: dict[int, int]) -> str:
+    return ", ".join(
+        f"{count} packets of link type {link} ({udp.LINK_NAMES.get(link, 'not known here')})"
+        for link, count in links.items()
+    )
+
+
+def snap_text(count: udp.DatagramCount) -> str:
+    """What to say of packets of which only the beginning was captured."""
+    return (
+        f"{count.cut} packets were cut when they were captured, to {count.snap_bytes} bytes or less (snap length); capture whole "
+        "packets, with tcpdump -s 0"
+    )
 
 
 class Tlog:
-    """A telemetry log of Mission Planner or MAVProxy."""
+    """A telemetry log of Mission Planner or MAVProxy; `content` is the file, or what was in it where it is compressed."""
 
     kind = "tlog"
 
-    def __init__(self, path: Path, link: str) -> None:
+    def __init__(self, path: Path, link: str, content: Path) -> None:
         self.path = path
         self.count = tlog.TlogCount()
         self.steady = Steady()
         self._topic = records.MAVLINK.topic + link
-        with path.open("rb") as file:
+        with content.open("rb") as file:
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def events(self) -> Iterator[Event]:
@@ -205,10 +245,14 @@ class Tlog:
         for record in tlog.records(self._data, count):
             yield Event(record.time_ns, self._topic, record.data, b"")
 
+    @property
+    def mavlink_frames(self) -> int:
+        """See Source."""
+        return self.count.frames
+
     def facts(self) -> dict[str, Any]:
         """See Source."""
-        sha256 = hashlib.sha256(self._data).hexdigest()
-        return _facts(self, len(self._data), sha256, asdict(self.count) | asdict(self.steady))
+        return facts_of(self, self.path.stat().st_size, hash_of(self.path), asdict(self.count) | asdict(self.steady))
 
     def notes(self) -> list[str]:
         """See Source."""
@@ -226,17 +270,31 @@ class Tlog:
 
 @dataclass(slots=True)
 class DataflashLog:
-    """An autopilot's own log, kept byte for byte."""
+    """An autopilot's own log, kept byte for byte; `content` is the file, or what was in it where it is compressed."""
 
     path: Path
     link: str
+    content: Path
     kind: str = field(default="dataflash", init=False)
-    _hash: Any = field(default_factory=hashlib.sha256, init=False)
+
+    @property
+    def written_ns(self) -> int:
+        """When the file was written [ns]."""
+        return self.path.stat().st_mtime_ns
+
+    @property
+    def mavlink_frames(self) -> int:
+        """See Source."""
+        return 0
+
+    def events(self) -> Iterator[Event]:
+        """None: the stamps in it are not of the time of reception."""
+        return iter(())
 
     @property
     def pieces(self) -> int:
         """Messages that it makes."""
-        return -(-self.path.stat().st_size // _DATAFLASH_CHUNK)
+        return -(-self.content.stat().st_size // _DATAFLASH_CHUNK)
 
     def messages(self, start_ns: int) -> Iterator[LogMessage]:
         """The file in pieces, ahead of everything else in the log, which starts at `start_ns` [ns].
@@ -245,15 +303,14 @@ class DataflashLog:
         """
         topic = records.DATAFLASH.topic + self.link
         time_ns = start_ns - self.pieces
-        with self.path.open("rb") as file:
+        with self.content.open("rb") as file:
             while piece := file.read(_DATAFLASH_CHUNK):
-                self._hash.update(piece)
                 yield LogMessage(topic, time_ns, records.encode_raw(time_ns, [(time_ns, piece)], self.link))
                 time_ns += 1
 
     def facts(self) -> dict[str, Any]:
         """See Source."""
-        return _facts(self, self.path.stat().st_size, self._hash.hexdigest(), {})
+        return facts_of(self, self.path.stat().st_size, hash_of(self.path), {})
 
     def notes(self) -> list[str]:
         """See Source."""
@@ -263,35 +320,38 @@ class DataflashLog:
         """See Source."""
 
 
-def open_mavlink(path: Path, link: str) -> Tlog | DataflashLog:
-    """Open a recording of the autopilot, told by its content, not by its name.
+def open_mavlink(path: Path, link: str, folder: Path) -> Tlog | DataflashLog:
+    """Open a recording of the autopilot, told by its content, not by its name; a compressed one is unpacked into `folder`.
 
     Raises
     ------
     CaptureError
         No such file, or neither a telemetry log nor a dataflash log.
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(1 << 16)
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be opened ({error.strerror})") from None
-    if dataflash.is_dataflash(head):
-        return DataflashLog(path, link)
-    if tlog.is_tlog(head):
-        return Tlog(path, link)
+    content, damage = packed.unpacked(path, folder)
+    with content.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    kind = kind_of(head)
+    if kind.name == DATAFLASH:
+        return DataflashLog(path, link, content)
+    if kind.name == TLOG:
+        return Tlog(path, link, content)
+    raise CaptureError(f"{path}: {damage or _no_autopilot(head, kind)}")
+
+
+def _no_autopilot(head: bytes, kind: Kind) -> str:
+    """What a file is that is no recording of an autopilot."""
     if not head:
-        raise CaptureError(f"{path}: is empty, expected a .tlog or a dataflash .bin")
+        return "is empty, expected a .tlog or a dataflash .bin"
+    if kind.remedy:
+        return f"is {kind.what}, expected a .tlog or a dataflash .bin; {kind.remedy}"
     if tlog.is_plain_mavlink(head):
-        raise CaptureError(
-            f"{path}: is a plain MAVLink byte stream without times; a .tlog or a dataflash .bin is needed"
-        )
-    raise CaptureError(
-        f"{path}: is neither a telemetry log (.tlog: times and MAVLink frames) nor a dataflash log (.bin)"
-    )
+        return "is a plain MAVLink byte stream without times; a .tlog or a dataflash .bin is needed"
+    return "is neither a telemetry log (.tlog: times and MAVLink frames) nor a dataflash log (.bin)"
 
 
-def _facts(source: Source, size: int, sha256: str, counters: dict[str, Any]) -> dict[str, Any]:
+def facts_of(source: Source, size: int, sha256: str, counters: dict[str, Any]) -> dict[str, Any]:
+    """Name, size, hash and counters of a source."""
     return {
         "name": source.path.name,
         "kind": source.kind,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final, TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from flightlog.errors import LogError
 from flightlog.nmea import checksum
 from groundproc.flight.positions.scales import in_era, stray
 from groundproc.flight.positions.solution import ANTENNA, MSL, Quality, Solution, tidied
+from groundproc.text import open_text
 
 Array = npt.NDArray[np.float64]
 
@@ -118,7 +119,8 @@ def read_nmea(path: Path, *, near_utc_ns: int | None = None) -> Solution:
     """
     reader = _Reader()
     try:
-        with path.open("rb") as file:
+        # one byte a character: what is between sentences may be anything
+        with open_text(path, "latin-1") as file:
             for body, kind, given in _sentences(file):
                 reader.take(body, kind, given)
     except OSError as error:
@@ -130,10 +132,10 @@ def read_nmea(path: Path, *, near_utc_ns: int | None = None) -> Solution:
     return tidied(_solution(path, placed, reader.left_out), str(path))
 
 
-def _sentences(file: BinaryIO) -> Iterator[tuple[bytes, str, bytes | None]]:
+def _sentences(file: TextIO) -> Iterator[tuple[bytes, str, bytes | None]]:
     """Body, kind and checksum of each sentence; lines are cut where a file of other content has none."""
     while line := file.readline(_LONGEST_LINE):
-        for body, kind, given in _SENTENCE.findall(line):
+        for body, kind, given in _SENTENCE.findall(line.encode("latin-1", "replace")):
             yield body, kind.decode("ascii"), given or None
 
 

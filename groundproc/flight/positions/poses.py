@@ -9,6 +9,7 @@ import numpy.typing as npt
 from flightlog.errors import LogError
 from groundproc.flight.positions.posetable import read_pose_table
 from groundproc.flight.positions.solution import ELLIPSOID, INS, Quality, Solution, diagonal_covariance, tidied
+from groundproc.text import names_of, open_text, table_of
 
 Array = npt.NDArray[np.float64]
 
@@ -23,7 +24,9 @@ _DEG2: Final = np.deg2rad(1.0) ** 2
 
 def looks_like_poses(head: str) -> bool:
     """Whether a text begins with our column names."""
-    return "utc_ns" in [name.strip() for name in head.split("\n", 1)[0].split(",")]
+    first = next((line for line in head.splitlines() if line.strip() and not line.lower().startswith("sep=")), "")
+    found = names_of(first, "utc_ns")
+    return found is not None and "utc_ns" in found[0]
 
 
 def read_poses(path: Path, *, height_reference: str = ELLIPSOID) -> Solution:
@@ -72,16 +75,14 @@ def read_poses(path: Path, *, height_reference: str = ELLIPSOID) -> Solution:
 
 def _extra(path: Path, names: list[str]) -> dict[str, Array]:
     """The columns of a table, whose rows are known to be whole, that have one of these names."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        header = [name.strip() for name in file.readline().split(",")]
+    with open_text(path) as file:
+        rows_of = table_of(file, str(path), "utc_ns", LogError, "expected poses")
+        header = rows_of.names
         found = {name: header.index(name) for name in names if name in header}
         if not found:
             return {}
         rows = []
-        for number, line in enumerate(file, 2):
-            words = line.strip().split(",")
-            if words == [""]:
-                continue
+        for number, words in rows_of.rows():
             try:
                 rows.append([float(words[place]) for place in found.values()])
             except ValueError:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.errors import LogError
+from groundproc.text import open_text, table_of
 
 Array = npt.NDArray[np.float64]
 
@@ -92,22 +93,17 @@ def _sigmas(column: dict[str, Array], names: tuple[str, ...]) -> Array:
 
 def _read(path: Path) -> tuple[list[str], npt.NDArray[np.int64], Array]:
     """Names of the columns that mean something here, stamps, and the values, shape (n, names)."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        header = [name.strip() for name in file.readline().split(",")]
-        if "utc_ns" not in header:
-            raise LogError(f"{path}: the first line has no column utc_ns; a trajectory has {', '.join(COLUMNS[:10])}")
+    with open_text(path) as file:
+        rows_of = table_of(file, str(path), "utc_ns", LogError, f"a trajectory has {', '.join(COLUMNS[:10])}")
+        header = rows_of.names
         names: list[str] = [name for name in COLUMNS if name in header]
         places = [header.index(name) for name in names]
         stamps, rows = [], []
-        for number, line in enumerate(file, 2):
-            words = line.strip().split(",")
-            if words == [""]:
-                continue
-            row = _numbers([words[place] for place in places], names) if len(words) == len(header) else None
+        for number, words in rows_of.rows():
+            row = _numbers([words[place] for place in places], names)
             if row is None:
-                raise LogError(
-                    f"{path}: line {number} is not {len(header)} values, utc_ns a whole number and the pose one that can be"
-                )
+                expected = f"{len(header)} values, utc_ns a whole number and the pose one that can be"
+                raise LogError(f"{path}: line {number}: {rows_of.blame(words, expected)}")
             stamps.append(row[0])
             rows.append(row[1])
     return names, np.array(stamps, np.int64), np.array(rows, np.float64).reshape(len(rows), len(names))

@@ -29,6 +29,7 @@ from groundproc.flight.positions.combine import Combined, combined, refuted
 from groundproc.flight.positions.ellipsoid import ecef_from_geodetic, geodetic_from_ecef
 from groundproc.flight.positions.rtklib import read_pos, write_pos
 from groundproc.flight.positions.solution import Quality, Solution
+from groundproc.text import head_of, is_plain, make_plain, open_text
 
 Array = npt.NDArray[np.float64]
 Advance = Callable[[float], None]
@@ -249,13 +250,15 @@ def _taken(path: Path, stem: str, folder: Path) -> list[_Input]:
     """One file of the user as what it is, by its content."""
     whole = _unpacked(path, folder / f"{stem}.raw")
     try:
-        with whole.open("rb") as file:
-            kind = rinex.kind_of(file.read(1 << 16))
+        kind = rinex.kind_of(head_of(whole, 1 << 16))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror})") from None
     if kind in ("observations", "navigation"):
         link = folder / f"{stem}.{'obs' if kind == 'observations' else 'nav'}"
-        link.symlink_to(whole.resolve())
+        if is_plain(whole):
+            link.symlink_to(whole.resolve())
+        else:  # RTKLIB looks at columns of plain text
+            make_plain(whole, link)
         return [_Input(path.name, kind, link)]
     if kind == "ubx":
         return _converted(path, whole, stem, folder)
@@ -314,7 +317,7 @@ def _has_body(path: Path) -> bool:
     """Whether a RINEX file has anything after its header."""
     if not path.is_file():
         return False
-    with path.open(encoding="ascii", errors="replace") as file:
+    with open_text(path) as file:
         for line in file:
             if line[60:].startswith("END OF HEADER"):
                 return bool(next(file, "").strip())

@@ -8,8 +8,15 @@ from groundproc.flight.positions.nmea import looks_like_nmea, read_nmea
 from groundproc.flight.positions.poses import looks_like_poses, read_poses
 from groundproc.flight.positions.rinex import is_raw_observations
 from groundproc.flight.positions.rtklib import looks_like_pos, read_pos
-from groundproc.flight.positions.sbet import looks_like_accuracy, looks_like_sbet, read_sbet
+from groundproc.flight.positions.sbet import (
+    DEGREES_SENTENCE,
+    in_degrees,
+    looks_like_accuracy,
+    looks_like_sbet,
+    read_sbet,
+)
 from groundproc.flight.positions.solution import ELLIPSOID, Solution, dated
+from groundproc.text import head_of
 
 _HEAD: Final = 1 << 16
 
@@ -42,8 +49,7 @@ def read_solution(
         It cannot be read, or is none of these.
     """
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
+        head = head_of(path, _HEAD)
         size = path.stat().st_size
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from None
@@ -54,6 +60,8 @@ def read_solution(
         return dated(read_poses(path, height_reference=poses_height), near_utc_ns)
     if looks_like_nmea(head):
         return dated(read_nmea(path, near_utc_ns=near_utc_ns), near_utc_ns)
+    if degrees := in_degrees(head, size):
+        raise LogError(f"{path}: looks like an SBET, but its {degrees} {DEGREES_SENTENCE}")
     if looks_like_sbet(head, size):
         return read_sbet(path, near_utc_ns=near_utc_ns, week=week, accuracy=accuracy, utc_seconds=utc_seconds)
     raise LogError(f"{path}: {_what_else(head, size)}, expected an RTKLIB .pos, an SBET, NMEA, or a table with utc_ns")

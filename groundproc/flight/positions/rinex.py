@@ -12,6 +12,7 @@ from typing import Final
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
+from groundproc.text import open_text
 
 UBX_SYNC: Final = b"\xb5\x62"
 _RTCM3: Final = 0xD3
@@ -100,7 +101,7 @@ def observations(path: Path) -> Observations:
         It is none, its version is not known to RTKLIB, or it has no epoch with observations.
     """
     found = Observations()
-    with path.open(encoding="ascii", errors="replace") as file:
+    with open_text(path) as file:
         lines = iter(file)
         types = _observation_header(lines, found, path)
         epochs = _v3_epochs(lines) if found.version >= 3 else _v2_epochs(lines, types)
@@ -210,7 +211,7 @@ def navigation(path: Path) -> Navigation:
     """
     found = Navigation()
     system = "G"
-    with path.open(encoding="ascii", errors="replace") as file:
+    with open_text(path) as file:
         lines = iter(file)
         for content, label in _header(lines):
             if label == "RINEX VERSION / TYPE":

@@ -23,6 +23,7 @@ from flightlog.errors import LogError
 from groundproc.flight.positions.ellipsoid import ecef_from_geodetic, geodetic_from_ecef, mat_ecef_enu, turned
 from groundproc.flight.positions.scales import gps_calendar_from_utc, utc_from_gps_calendar
 from groundproc.flight.positions.solution import ANTENNA, ELLIPSOID, MSL, Quality, Solution, symmetric, tidied
+from groundproc.text import decimal_comma, open_text
 
 Array = npt.NDArray[np.float64]
 
@@ -141,9 +142,9 @@ def _parse(path: Path) -> tuple[_Header, Array, npt.NDArray[np.int64], int]:
     header = _Header()
     rows: list[list[float]] = []
     times: list[int] = []
-    damaged = 0
+    damaged, comma = 0, ""
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with open_text(path) as file:
             for line in file:
                 if line.startswith("%"):
                     _header_line(line.rstrip("\r\n"), header)
@@ -151,6 +152,7 @@ def _parse(path: Path) -> tuple[_Header, Array, npt.NDArray[np.int64], int]:
                     row = _row(line, header) if header.names else None
                     if row is None:
                         damaged += 1
+                        comma = comma or decimal_comma(line.split(header.separator))
                         continue
                     times.append(row[0])
                     rows.append(row[1])
@@ -161,9 +163,8 @@ def _parse(path: Path) -> tuple[_Header, Array, npt.NDArray[np.int64], int]:
             f"{path}: has no line of column names (% GPST latitude(deg) ...); RTKLIB's option out-outhead=on writes it"
         )
     if not rows:
-        raise LogError(
-            f"{path}: holds no position; RTKLIB found none" + (f", {damaged} lines are damaged" if damaged else "")
-        )
+        reason = f"; {comma}" if comma else f", {damaged} lines are damaged" if damaged else ""
+        raise LogError(f"{path}: holds no position; RTKLIB found none{reason}")
     return header, np.array(rows), _utc_ns(np.array(times, np.int64), header.scale), damaged
 
 

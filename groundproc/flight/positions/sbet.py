@@ -43,9 +43,13 @@ _LARGEST: Final = {
     "z_velocity": 1e4, "roll": 7.0, "pitch": 7.0, "platform_heading": 7.0, "wander_angle": 7.0,
 }  # fmt: skip
 """Magnitudes that values cannot exceed; angles are written within a turn."""
+_DEGREES: Final = {"latitude": 90.0, "roll": 180.0, "pitch": 90.0}
+_SPEEDS: Final = ("altitude", "x_velocity", "y_velocity", "z_velocity")
 _MOST: Final = 0.9
 """This part of the first records must be sound for a file to be taken for an SBET."""
 _LONGEST_STEP_S: Final = 60.0
+_PROBED: Final = 400
+DEGREES_SENTENCE: Final = "is in degrees, expected radians, as every SBET has them; export it in radians"
 _VELOCITY_MISFIT: Final = 0.1
 """Velocities may contradict the positions by this part of the speed, plus 0.1 m/s."""
 
@@ -56,6 +60,40 @@ def looks_like_sbet(head: bytes, size: int) -> bool:
     if records is None:
         return False
     return _rising(records["time"]) and float(_sound(records).mean()) > _MOST
+
+
+def in_degrees(head: bytes, size: int) -> str:
+    """What of an SBET that begins so is in degrees, in words; empty where nothing is, or where it is none.
+
+    Latitudes beyond a quarter of a turn and headings beyond a whole one are no radians. Near the equator and Greenwich degrees may pass for
+    radians, but the way between places is then 57 times what the velocities say.
+    """
+    records = _whole(head, RECORD, size)
+    if records is None or not _rising(records["time"]):
+        return ""
+    angles = {name: np.abs(records[name]) for name in ("latitude", "longitude", "roll", "pitch", "platform_heading")}
+    with np.errstate(invalid="ignore"):
+        possible = np.all([angle <= _DEGREES.get(name, 360.0) for name, angle in angles.items()], axis=0)
+        possible &= np.all([np.abs(records[name]) <= _LARGEST[name] for name in _SPEEDS], axis=0)
+        if float(possible.mean()) <= _MOST:
+            return ""
+        found = []
+        if float(np.median(angles["latitude"])) > np.pi / 2 or _too_fast(records[possible]):
+            found.append("latitude and longitude")
+        if float(np.quantile(angles["platform_heading"], 0.9)) > _LARGEST["platform_heading"]:
+            found.append("attitude")
+    return " and ".join(found)
+
+
+def _too_fast(records: npt.NDArray[np.void]) -> bool:
+    """Whether places, taken as radians, lie as much too far apart as degrees would."""
+    if len(records) < 2 or float(np.abs(records["latitude"]).max()) > np.pi / 2:
+        return False
+    found, mean = _speeds(records, np.stack([records[name] for name in _SPEEDS[1:]], axis=-1))
+    ratio = float(
+        np.nanmedian(np.linalg.norm(found, axis=1)) / max(float(np.nanmedian(np.linalg.norm(mean, axis=1))), 0.5)
+    )
+    return bool(np.rad2deg(1.0) / 1.5 < ratio < np.rad2deg(1.0) * 1.5)
 
 
 def looks_like_accuracy(head: bytes, size: int) -> bool:
@@ -119,6 +157,8 @@ def read_sbet(
     whole = _read(path, RECORD, "an SBET (17 doubles a record)")
     if interval_s > 0:
         whole = whole[first_of_each(whole["time"], interval_s)]
+    if degrees := in_degrees(whole[:_PROBED].tobytes(), len(whole[:_PROBED]) * RECORD.itemsize):
+        raise LogError(f"{path}: its {degrees} {DEGREES_SENTENCE}")
     records = whole[_sound(whole)]
     if not len(records):
         raise LogError(f"{path}: none of its {len(whole)} records holds a place, a velocity and an attitude")
@@ -271,11 +311,16 @@ def _agrees(records: npt.NDArray[np.void], velocity: Array) -> bool:
     """Whether velocities, integrated, give the way between positions."""
     if len(records) < 2:
         return True
+    found, mean = _speeds(records, velocity)
+    misfit = np.linalg.norm(found - mean, axis=1)
+    return bool(np.nanmedian(misfit) <= 0.1 + _VELOCITY_MISFIT * np.nanmedian(np.linalg.norm(mean, axis=1)))
+
+
+def _speeds(records: npt.NDArray[np.void], velocity: Array) -> tuple[Array, Array]:
+    """Velocities east, north, up by the way from record to record, and means of those stated, shape (n - 1, 3)."""
     latitude, longitude = np.rad2deg(records["latitude"]), np.rad2deg(records["longitude"])
     place = ecef_from_geodetic(latitude, longitude, records["altitude"])
     way = np.einsum("nji,nj->ni", mat_ecef_enu(latitude[:-1], longitude[:-1]), np.diff(place, axis=0))
     step_s = np.diff(records["time"])
     found = way / np.where(step_s > 0, step_s, np.nan)[:, None]
-    mean = 0.5 * (velocity[1:] + velocity[:-1])
-    misfit = np.linalg.norm(found - mean, axis=1)
-    return bool(np.nanmedian(misfit) <= 0.1 + _VELOCITY_MISFIT * np.nanmedian(np.linalg.norm(mean, axis=1)))
+    return found, 0.5 * (velocity[1:] + velocity[:-1])

@@ -10,6 +10,8 @@ from flightlog.constants import NS_PER_S
 from groundproc.numerics import robust
 
 _FEWEST: Final = 5
+_SHORTEST_NS: Final = NS_PER_S // 2
+"""Over less than this the jitter of receive times, tens of microseconds, is more than any drift."""
 _CLIP: Final = 4.0
 
 
@@ -31,7 +33,7 @@ def drift(pairs: npt.NDArray[np.int64], jumps: Sequence[int]) -> dict[str, Any] 
     """
     stretches = np.split(pairs, list(jumps))
     longest = max(stretches, key=len)
-    if len(longest) < _FEWEST or longest[0, 0] == longest[-1, 0]:
+    if len(longest) < _FEWEST or longest[-1, 0] - longest[0, 0] < _SHORTEST_NS:
         return None
     middle_ns = int(longest[:, 0].mean())
     time_s = (longest[:, 0] - middle_ns) / NS_PER_S

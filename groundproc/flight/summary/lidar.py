@@ -58,6 +58,9 @@ class LidarSummary:
     """Of each batch: lidar time, and the least that its packets came after it [ns]."""
     jumps: list[int] = field(default_factory=list)
     out_of_order: int = 0
+    duplicates: int = 0
+    late: int = 0
+    """Of those out of order, that came a message late: they were counted as missing."""
     _last: tuple[int, int] | None = None
 
     def add(self, batch: LidarBatch) -> None:
@@ -69,6 +72,8 @@ class LidarSummary:
             self.jumps.append(len(self.clock))
         if not len(batch.packets):
             return
+        self.duplicates += batch.duplicates
+        self.out_of_order += batch.moved
         digest = self.model.digest(batch.packets)
         self.packets += len(batch.packets)
         self.shots_with_return += digest.returns
@@ -95,11 +100,12 @@ class LidarSummary:
         """Rate of turn and gaps between neighbouring packets, the last of the batch before included."""
         azimuth = digest.azimuth_cdeg[:, 0]
         if self._last is not None:
-            azimuth = np.concatenate([[self._last[0]], azimuth])
-            device_ns = np.concatenate([[self._last[1]], device_ns])
+            early = device_ns < self._last[1]
+            self.late += int(early.sum())
+            azimuth = np.concatenate([[self._last[0]], azimuth[~early]])
+            device_ns = np.concatenate([[self._last[1]], device_ns[~early]])
         self._last = int(azimuth[-1]), int(device_ns[-1])
         passed_ns = np.diff(device_ns)
-        self.out_of_order += int((passed_ns <= 0).sum())
         packet_ns = int(digest.record_ns[0])
         missing = np.rint(passed_ns / packet_ns).astype(np.int64) - 1
         neighbours = missing == 0
@@ -124,6 +130,7 @@ class LidarSummary:
         sensor_off = self._empty_sector() if turns >= _FEWEST_TURNS else None
         gaps = np.concatenate([np.empty((0, 4)), *self.missing])
         missing, aboard, sensor = _reasons(gaps, self.window, sensor_off, self._packet_ns(), self.model.idle_ns)
+        missing -= min(self.late, missing - aboard - sensor)
         rates = np.array(self.rates_rpm)
         return {
             "model": self.model.name,
@@ -137,7 +144,8 @@ class LidarSummary:
             "lost_packets": missing - aboard - sensor,
             "missing_outside_window_aboard": aboard,
             "missing_outside_sensor_fov": sensor,
-            "out_of_order": self.out_of_order,
+            "out_of_order": self.out_of_order + self.late,
+            "duplicates": self.duplicates,
             "account": dict(self.totals) if self.accounts else None,
             "window_aboard_deg": [value / 100 for value in self.window] if self.window else None,
             "sensor_fov_deg": [sensor_off[1] / 100, sensor_off[0] / 100] if sensor_off else None,

@@ -18,6 +18,7 @@ from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import BatchJoiner, DeviceClock, PositionBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
 from groundproc.flight.summary.position import PositionSummary
+from groundproc.flight.summary.rates import rate_hz, rounded
 from groundproc.flight.summary.telemetry import TelemetrySummary
 from groundproc.sensors import velodyne
 from groundproc.sensors.model import Lidar
@@ -132,7 +133,7 @@ class LogSummary:
     def result(self) -> dict[str, Any]:
         """The figures of the messages; see `swath info --json`."""
         return {
-            "topics": {name: _topic(topic) for name, topic in sorted(self.topics.items())},
+            "topics": {name: _topic(name, topic) for name, topic in sorted(self.topics.items())},
             "lidar": self.lidar.result() if self._seen(*self._batches.topics) else None,
             "position": self.position.result() if self._seen(records.POSITION.topic) else None,
             "mavlink": {
@@ -174,13 +175,15 @@ class LogSummary:
         return any(topic in self.topics for topic in topics)
 
 
-def _topic(topic: _Topic) -> dict[str, Any]:
-    duration_s = (topic.last_ns - topic.first_ns) / NS_PER_S
+def _topic(name: str, topic: _Topic) -> dict[str, Any]:
+    span_ns = topic.last_ns - topic.first_ns
+    # the stamps of a dataflash log's pieces say nothing but their order
+    rate = None if name.startswith(records.DATAFLASH.topic) else rate_hz(topic.messages, span_ns)
     return {
         "messages": topic.messages,
         "bytes": topic.size,
-        "rate_hz": round((topic.messages - 1) / duration_s, 3) if duration_s > 0 else None,
-        "duration_s": round(duration_s, 3),
+        "rate_hz": rounded(rate, 3),
+        "duration_s": round(span_ns / NS_PER_S, 3),
     }
 
 

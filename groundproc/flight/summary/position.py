@@ -9,6 +9,7 @@ from flightlog import clock, nmea
 from flightlog.constants import NS_PER_S
 from flightlog.hdl32e import PpsState
 from groundproc.flight.load import PositionBatch, Sentence, new_sentences
+from groundproc.flight.summary.rates import rate_hz, rounded
 
 _HOUR_NS: Final = 3600 * NS_PER_S
 _LONGEST_LAG_NS: Final = 3 * NS_PER_S
@@ -80,11 +81,10 @@ class PositionSummary:
 
     def result(self) -> dict[str, Any]:
         """The figures; see `swath info --json`."""
-        duration_s = (self.last_ns - (self.first_ns or 0)) / NS_PER_S
         lag_ns = self.lag_ns()
         return {
             "packets": self.packets,
-            "rate_hz": round((self.packets - 1) / duration_s, 2) if duration_s > 0 else None,
+            "rate_hz": rounded(rate_hz(self.packets, self.last_ns - (self.first_ns or 0)), 2),
             "with_imu": self.with_imu,
             "pps": {_pps_name(state): count for state, count in sorted(self.pps.items())},
             "gps": {

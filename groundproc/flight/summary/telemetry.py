@@ -5,15 +5,15 @@ from functools import cache
 from typing import Any, Final
 
 from flightlog import clock
-from flightlog.constants import NS_PER_S
 from flightlog.mavlink import Frame, message_id, payload_dtype
 from flightlog.vehicles import Vehicles
 from groundproc.flight.claims import can_be
+from groundproc.flight.summary.numbering import Numbering
+from groundproc.flight.summary.rates import rate_hz, rounded
 
 _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
 """A boot time this much below the last one is a new boot; messages that overtake each other differ by less."""
-_REORDERED: Final = 128
 _SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
 _GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
 _BOOT_TIMED: Final = tuple(message_id(name) for name in ("SYSTEM_TIME", "ATTITUDE", "GLOBAL_POSITION_INT"))
@@ -44,8 +44,7 @@ class _Node:
     """One component of one system."""
 
     kinds: dict[int, _Kind] = field(default_factory=dict)
-    sequence: int | None = None
-    lost: int = 0
+    numbers: Numbering = field(default_factory=Numbering)
     boots: list[_Boot] = field(default_factory=list)
 
 
@@ -73,10 +72,7 @@ class TelemetrySummary:
         kind = node.kinds.setdefault(frame.message_id, _Kind(frame.name, 0, frame.time_ns))
         kind.count += 1
         kind.last_ns = frame.time_ns
-        if node.sequence is not None:
-            skipped = (frame.sequence - node.sequence - 1) % 256
-            node.lost += skipped if skipped < _REORDERED else 0
-        node.sequence = frame.sequence
+        node.numbers.take(frame)
         self.vehicles.hear(frame)
         if frame.message_id == _GPS_RAW_INT:
             self.fix_type = max(self.fix_type or 0, _value(frame, "fix_type"))
@@ -100,7 +96,9 @@ class TelemetrySummary:
             "frames": self.frames,
             "unknown_frames": unknown,
             "bad_bytes": bad_bytes,
-            "lost_frames": sum(node.lost for node in autopilots.values()),
+            "lost_frames": sum(node.numbers.lost for node in autopilots.values()),
+            "duplicate_frames": sum(node.numbers.duplicates for node in autopilots.values()),
+            "late_frames": sum(node.numbers.late for node in autopilots.values()),
             "autopilots": [_autopilot(key, node) for key, node in autopilots.items()],
             "reboots": sum(max(len(node.boots) - 1, 0) for node in autopilots.values()),
             "gps_fix_type": self.fix_type,
@@ -118,6 +116,8 @@ class TelemetrySummary:
 def _boot(node: _Node, time_ns: int, boot_ms: int) -> None:
     last = node.boots[-1] if node.boots else None
     if last is None or (last.last_ms - boot_ms > _REBOOT_MS and last.last_ms - boot_ms < _WRAP_MS - _REBOOT_MS):
+        if last is not None:
+            node.numbers.restarted(time_ns)
         node.boots.append(_Boot(time_ns, boot_ms, time_ns, boot_ms))
         return
     last.last_ns, last.last_ms = time_ns, boot_ms
@@ -127,7 +127,7 @@ def _autopilot(key: tuple[int, int], node: _Node) -> dict[str, Any]:
     return {
         "system": key[0],
         "component": key[1],
-        "lost_frames": node.lost,
+        "lost_frames": node.numbers.lost,
         "boots": [
             {
                 "from_utc": clock.utc_text(boot.first_ns),
@@ -141,13 +141,12 @@ def _autopilot(key: tuple[int, int], node: _Node) -> dict[str, Any]:
 
 
 def _kind(key: tuple[int, int], kind: _Kind) -> dict[str, Any]:
-    duration_s = (kind.last_ns - kind.first_ns) / NS_PER_S
     return {
         "system": key[0],
         "component": key[1],
         "name": kind.name,
         "count": kind.count,
-        "rate_hz": round((kind.count - 1) / duration_s, 3) if duration_s > 0 else None,
+        "rate_hz": rounded(rate_hz(kind.count, kind.last_ns - kind.first_ns), 3),
     }
 
 

@@ -64,5 +64,5 @@ def test_a_file_that_is_not_there_or_has_other_columns_is_refused(tmp_path: Path
     with pytest.raises(SwathError, match="cannot be read"):
         read_control(tmp_path / "nowhere.csv")
     (tmp_path / "c.csv").write_text("east,north,up\n1,2,3\n")
-    with pytest.raises(SwathError, match="no column x, y, z, sigma"):
+    with pytest.raises(SwathError, match="no column x; control has x, y, z, sigma"):
         read_control(tmp_path / "c.csv")

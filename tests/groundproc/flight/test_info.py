@@ -247,14 +247,16 @@ def test_the_keys_of_the_json_are_these(monterey_log: Path) -> None:
         "topics", "truncated", "utc",
     ]  # fmt: skip
     assert sorted(summary["lidar"]) == [
-        "account", "azimuth_coverage_deg", "clock", "lost_packets", "missing_outside_sensor_fov",
+        "account", "azimuth_coverage_deg", "clock", "duplicates", "lost_packets", "missing_outside_sensor_fov",
         "missing_outside_window_aboard", "missing_packets", "model", "out_of_order", "packets", "return_mode", "rpm", "rpm_spread",
         "sensor_fov_deg", "shots_with_return", "turns", "window_aboard_deg",
     ]  # fmt: skip
 
 
-def test_a_file_that_is_no_log_is_one_sentence(recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(recordings / "lidar/hdl32e_monterey.pcap")]) == 1
+def test_a_file_that_is_no_log_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("these are no packets\n")
+    assert main(["info", str(text)]) == 1
     error = capsys.readouterr().err
     assert "is no MCAP file" in error
     assert error.count("\n") == 1

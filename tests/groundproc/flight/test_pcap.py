@@ -60,7 +60,7 @@ def test_the_datagram_is_found_behind_every_link_layer(
 ) -> None:
     link, frame = link_layers(ethernet(b"payload", 8308))[name]
     found, count = read_udp(pcap([(TIMES_NS[0], frame)], link=link))
-    assert found == [Datagram(TIMES_NS[0], b"\xc0\xa8\x01\xc9", 8308, b"payload")]
+    assert found == [Datagram(TIMES_NS[0], b"\xc0\xa8\x01\xc9", 8308, b"payload", 443)]
     assert (count.datagrams, count.other) == (1, 0)
 
 
@@ -79,7 +79,7 @@ def test_an_unknown_link_layer_is_counted_not_guessed(
     pcap: Callable[..., bytes], ethernet: Callable[..., bytes]
 ) -> None:
     found, count = read_udp(pcap([(0, ethernet(b"x"))], link=105))
-    assert (found, count.other) == ([], 1)
+    assert (found, count.other, count.links) == ([], 0, {105: 1})
 
 
 def test_a_pcapng_of_another_writer_reads_as_it_reads_itself(ethernet: Callable[..., bytes]) -> None:
