@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-HELP = "say what a flight log holds: rates, losses, clocks, gaps"
+HELP = "say what a flight log holds and how good it is; exit code 0 good, 3 doubtful, 1 bad"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
     from flightlog.logfile import LogReader
     from groundproc.flight.summary.log import summarise
     from groundproc.flight.summary.text import as_text
+    from groundproc.verdict import judge_log
 
     with LogReader(arguments.log) as reader:
         hidden = not sys.stderr.isatty()
@@ -30,5 +31,10 @@ def run(arguments: argparse.Namespace) -> int:
                 bar.update(size)
 
             summary = summarise(reader, advance)
-    print(json.dumps(summary, indent=2) if arguments.json else as_text(summary))
-    return 0
+    verdict = judge_log(summary)
+    if arguments.json:
+        print(json.dumps(verdict.to_mapping() | summary, indent=2))
+        print(verdict.line(), file=sys.stderr)
+    else:
+        print(f"{as_text(summary)}\n\n{verdict.line()}")
+    return verdict.exit_code

@@ -69,11 +69,20 @@ def run(arguments: argparse.Namespace) -> int:
         _print_states(found, folder, arguments.json)
         return 0
     quality = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
-    print(json.dumps(quality, indent=2) if arguments.json else _report(quality, folder))
-    if quality["trajectory"]["warning"]:
-        print(f"swath: {quality['trajectory']['warning']}", file=sys.stderr)
-        return 1
-    return 0
+    return _tell(quality, folder, arguments.json)
+
+
+def _tell(quality: dict[str, Any], folder: Path, as_json: bool) -> int:
+    """Print what came of it: figures, every warning, and the verdict as the last line; give its exit code."""
+    from groundproc.verdict import Verdict, warnings_in
+
+    verdict = Verdict.from_mapping(quality)
+    print(json.dumps(quality, indent=2) if as_json else _report(quality, folder), flush=True)
+    for warning in warnings_in(quality):
+        print(f"swath: warning: {warning}", file=sys.stderr, flush=True)
+    # with --json the verdict is the object's first key, and the object stays the only thing on standard output
+    print(verdict.line(), file=sys.stderr if as_json else sys.stdout)
+    return verdict.exit_code
 
 
 def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:

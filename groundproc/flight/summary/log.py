@@ -137,12 +137,21 @@ class LogSummary:
                 link: telemetry.result(parser.bad_bytes, parser.unknown)
                 for link, (parser, telemetry) in sorted(self.links.items())
             },
+            "lidar_with_autopilot_s": self._together_s(),
             "gaps": self.gaps,
             "gap_count": self.gap_count,
             "messages_backwards": self.backwards,
             "messages_damaged": self.damaged,
             "host_clock_steps": self.clock_steps,
         }
+
+    def _together_s(self) -> float | None:
+        """Seconds in which both lidar and autopilot were recorded; None where one of them was not at all."""
+        lidar, link = self.topics.get(self.model.topic), self.topics.get(f"{records.MAVLINK.topic}ins")
+        if lidar is None or link is None:
+            return None
+        both_ns = min(lidar.last_ns, link.last_ns) - max(lidar.first_ns, link.first_ns)
+        return round(max(both_ns, 0) / NS_PER_S, 3)
 
     def _seen(self, *topics: str) -> bool:
         return any(topic in self.topics for topic in topics)

@@ -12,6 +12,8 @@ _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
 """A boot time this much below the last one is a new boot; messages that overtake each other differ by less."""
 _REORDERED: Final = 128
+FIX_3D: Final = 3
+"""`fix_type` of GPS_RAW_INT from which on there is a position with its height."""
 _HEARTBEAT: Final = message_id("HEARTBEAT")
 _SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
 _GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
@@ -58,6 +60,10 @@ class TelemetrySummary:
     first_utc_ns: int | None = None
     fix_type: int | None = None
     satellites: int | None = None
+    fixes: int = 0
+    """Reports of the receiver since its first fix in three dimensions."""
+    without_fix: int = 0
+    """Those of them without one."""
 
     def add(self, frame: Frame) -> None:
         """Take the next frame; one outside the dialect counts nothing, its sender is not proven."""
@@ -75,7 +81,11 @@ class TelemetrySummary:
         if frame.message_id == _HEARTBEAT:
             node.is_autopilot |= _value(frame, "autopilot") != AUTOPILOT_INVALID
         elif frame.message_id == _GPS_RAW_INT:
-            self.fix_type = max(self.fix_type or 0, _value(frame, "fix_type"))
+            fix_type = _value(frame, "fix_type")
+            self.fix_type = max(self.fix_type or 0, fix_type)
+            if self.fix_type >= FIX_3D:
+                self.fixes += 1
+                self.without_fix += fix_type < FIX_3D
             self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
         if frame.message_id in _BOOT_TIMED:
             _boot(node, frame.time_ns, _value(frame, "time_boot_ms"))
@@ -94,6 +104,7 @@ class TelemetrySummary:
             "reboots": sum(max(len(node.boots) - 1, 0) for node in autopilots.values()),
             "gps_fix_type": self.fix_type,
             "gps_satellites": self.satellites,
+            "gps_after_first_fix": {"reports": self.fixes, "without": self.without_fix} if self.fixes else None,
             "first_system_time_utc": clock.utc_text(self.first_utc_ns) if self.first_utc_ns else None,
             "messages": [
                 _kind(key, kind)
