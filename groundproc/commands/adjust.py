@@ -21,6 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--crs", "--epsg", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
+    parser.add_argument(
+        "--crs-anyway", action="store_true", help="take the CRS where it is not made for the place of the flight"
+    )
     parser.add_argument("--week", type=int, metavar="N", help="GPS week, where the files have only seconds of it")
     parser.add_argument(
         "--geoid", type=float, default=0.0, metavar="N",
@@ -53,7 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     crs = None if arguments.crs is None else projected_crs(arguments.crs)
     task = work.Task(
-        arguments.clouds, arguments.trajectory, arguments.output, crs, arguments.week, arguments.geoid, arguments.control, options
+        arguments.clouds, arguments.trajectory, arguments.output, crs, arguments.week, arguments.geoid, arguments.control, options,
+        arguments.crs_anyway,
     )  # fmt: skip
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

@@ -563,6 +563,9 @@ def test_a_folder_that_cannot_be_written_is_refused(
     [
         (["--epsg", "4326"], 1, "EPSG:4326"),
         (["--epsg", "999999"], 1, "EPSG:999999"),
+        (["--crs", "32610"], 1, "EPSG:32633"),
+        (["--crs-anyway"], 2, "but no crs"),
+        (["--geoid", "30"], 2, "geoid: 30 given, but nothing uses it"),
         (["--height", "ellipsoid"], 1, "--geoid"),
         (["--height", "ellipsoid", "--geoid", "nowhere.gtx"], 1, "nowhere.gtx"),
         (["--pose-grid", "10s"], 2, "10s"),

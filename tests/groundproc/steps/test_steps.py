@@ -102,13 +102,12 @@ def test_force_does_everything_and_gives_the_same_points(log: Path, out: Path, m
         (["--min-range", "5"], {"place", "quality", "products"}),
         (["--height", "relative"], {"trajectory", "place", "quality", "products"}),
         (["--pose-grid", "10ms"], {"trajectory", "place", "quality", "products"}),
-        (["--geoid", "30"], {"trajectory", "quality", "products"}),
+        (["--height", "ellipsoid", "--geoid", "30"], {"trajectory", "place", "quality", "products"}),
     ],
 )
 def test_a_setting_concerns_the_steps_that_look_at_it(
     log: Path, out: Path, words: list[str], done: set[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A geoid is read for the trajectory; with heights above the sea it changes nothing, and so what is made of it stays."""
     said = status(capsys, log, "--method", "ins", *words, "-o", out)
     assert process(log, out, *words) == done
     stale = steps_of(name for name, state in said.items() if state["state"] == "stale")
