@@ -229,11 +229,9 @@ def _log_gaps(summary: Figures) -> Iterator[Reason]:
 def _log_together(summary: Figures) -> Iterator[Reason]:
     both_s = summary["lidar_with_autopilot_s"]
     if both_s is not None and both_s < LEAST_S:
-        yield Reason(
-            BAD,
-            "together",
-            f"lidar and autopilot were recorded together for {both_s:.1f} s, expected {LEAST_S:g} s or more: are they of one flight?",
-        )
+        why = ": are they of one flight?" if both_s == 0.0 else ""
+        text = f"the log holds {both_s:.1f} s of lidar and autopilot together, expected {LEAST_S:g} s or more{why}"
+        yield Reason(BAD, "together", text)
 
 
 LOG_RULES: Final[tuple[Rule, ...]] = (_log_damage, _log_lidar, _log_autopilot, _log_together, _log_gaps)

@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog import config
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
     from groundproc.geodesy import projected_crs
     from groundproc.strips.options import StripOptions
 
@@ -50,6 +51,10 @@ def run(arguments: argparse.Namespace) -> int:
     for given, name in ((arguments.clouds, "LAS"), (arguments.trajectory, "-t"), (arguments.output, "-o")):
         if not given:
             raise UsageError(f"{name} is missing; expected swath adjust LAS... -t TRAJECTORY -o DIR")
+    expect(arguments.clouds, ("cloud",), "LAS or LAZ files")
+    expect([arguments.trajectory], SOLUTIONS, SOLUTION_WORDS)
+    expect([arguments.control], ("control", "table"), "a table of control points (CSV: x, y, z, sigma)")
+    expect_text(arguments.config, "options as YAML")
     options = config.load(arguments.config, StripOptions) if arguments.config else StripOptions()
 
     from groundproc.strips import work

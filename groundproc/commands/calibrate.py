@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from flightlog.logfile import LogReader
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
     from groundproc.estimation.calibration.compass import write_compass
     from groundproc.estimation.calibration.mount import calibrate
     from groundproc.files import made_folder, written_aside
@@ -53,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     logs = arguments.logs
     if len(set(logs)) < len(logs):
         raise UsageError("a log is named twice; its flight would count twice")
+    expect(logs, LOG, LOG_WORDS)
+    expect_text(arguments.mount, "a mount file (YAML)")
     with LogReader(logs[0]) as reader:
         nominal, _ = find_mount(str(arguments.mount) if arguments.mount else None, [reader])
         lasers = lidar_of([reader]).lasers

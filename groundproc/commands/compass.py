@@ -23,10 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit and write."""
+    from groundproc.commands.inputs import expect
     from groundproc.estimation.calibration.compass import fit_compass, write_compass
     from groundproc.estimation.dynamic.dynamic import settled_run
 
     paths = [path / "trims.csv" if path.is_dir() else path for path in arguments.trims]
+    expect(paths, ("trims", "table"), "the trims.csv of a run of method dynamic")
     curve = fit_compass([settled_run(path) for path in paths], arguments.harmonics)
     write_compass(arguments.output, curve)
     print(

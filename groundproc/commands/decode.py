@@ -22,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Decode, with a progress bar on a terminal."""
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.commands.values import field_of_view
     from groundproc.products.sensor_cloud import write_sensor_cloud
     from groundproc.progress import stages
@@ -31,6 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--min-range {arguments.min_range:g} --max-range {arguments.max_range:g}: expected 0 or more, and the first no larger"
         )
+    expect(arguments.logs, LOG, LOG_WORDS)
     gate = Gate(*field_of_view(arguments.fov), arguments.min_range, arguments.max_range)
     with stages(arguments.logs, {"decode": "points"}) as progress:
         cloud = write_sensor_cloud(arguments.logs, arguments.output, gate, lambda done: progress("decode", done))

@@ -44,7 +44,21 @@ def run(arguments: argparse.Namespace) -> int:
     kit = (arguments.scans, arguments.imu, arguments.positions)
     if any(kit) == bool(arguments.pcap) or (any(kit) and not all(kit)):
         raise UsageError("import: give --pcap, or all of --scans, --imu and --positions")
+    _expect(arguments)
     return _kit(arguments) if all(kit) else _captures(arguments)
+
+
+def _expect(arguments: argparse.Namespace) -> None:
+    """Refuse what is known to be another kind of file than its option takes."""
+    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
+
+    expect(arguments.pcap, ("capture", "gzip", "empty", "text", "yaml"), "captures of the lidar (pcap, pcapng)")
+    mavlink = ("tlog", "dataflash", "mavlink", "gzip", "empty", "text", "yaml")
+    expect(arguments.mavlink, mavlink, "recordings of the autopilot (.tlog, dataflash .bin)")
+    expect([arguments.scans], ("scans", "table", "archive", "gzip", "text"), "lines of a line scanner (CSV or NPZ)")
+    expect([arguments.imu], ("imu", "table", "gzip", "text"), "samples of an IMU (CSV)")
+    expect([arguments.positions], (*SOLUTIONS, "gzip", "table", "text"), SOLUTION_WORDS)
+    expect_text(arguments.mount, "a mount file (YAML)")
 
 
 def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:

@@ -19,10 +19,12 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.logfile import LogReader
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.flight.summary.log import summarise
     from groundproc.flight.summary.text import as_text
     from groundproc.verdict import judge_log
 
+    expect([arguments.log], LOG, LOG_WORDS)
     with LogReader(arguments.log) as reader:
         hidden = not sys.stderr.isatty()
         with tqdm(total=reader.size, unit="B", unit_scale=True, leave=False, disable=hidden) as bar:

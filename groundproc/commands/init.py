@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read the log but for its points, and write."""
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.files import written_aside
     from groundproc.progress import stages
     from groundproc.steps.facts import facts
@@ -25,6 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     path: Path | None = arguments.output
     if path is not None and path.exists() and not arguments.force:
         raise UsageError(f"{path}: is there; --force writes over it")
+    expect(arguments.logs, LOG, LOG_WORDS)
     with stages(arguments.logs, {"read": "clocks and autopilot"}) as progress:
         survey, notes, head = facts(arguments.logs, progress)
     text = sample(survey, notes, head)

@@ -68,6 +68,7 @@ def _metres(text: str) -> float:
 def run(arguments: argparse.Namespace) -> int:
     """Work until SIGINT or SIGTERM, and leave everything whole."""
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
     from groundproc.files import made_folder
     from groundproc.live.inbox import Inbox
     from groundproc.live.products import LiveTrajectory
@@ -80,6 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
         value = getattr(arguments, name)
         if value is not None and not value >= least:
             raise UsageError(f"--{name} {value}: expected {least} or more")
+    expect([arguments.follow], (*LOG, "empty"), LOG_WORDS)  # one that is yet to be written into may be empty
+    expect_text(arguments.mount, "a mount file (YAML)")
     over = threading.Event()
 
     def end(number: int, frame: FrameType | None) -> None:

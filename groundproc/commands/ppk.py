@@ -59,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import expect, expect_text
     from groundproc.flight.positions.ppk import Base, base_position, process
 
     if arguments.base_position is not None and arguments.base_average:
@@ -66,6 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
     where = Base(
         None if arguments.base_position is None else base_position(arguments.base_position), arguments.base_average
     )
+    observations = ("observations", "gzip", "navigation")  # what is within, RTKLIB's front end says
+    expect([arguments.rover, arguments.base], observations, "raw observations (u-blox .ubx, RINEX)")
+    expect(arguments.nav, observations, "RINEX navigation files")
+    expect_text(arguments.config, "options as YAML")
     hidden = not sys.stderr.isatty()
     with tqdm(
         total=1.0, leave=False, disable=hidden, bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}", desc="RTKLIB"

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from groundproc.steps.process import State
     from groundproc.steps.request import Request
+    from groundproc.survey import Survey
 
 HELP = "make a georeferenced cloud of a flight: cloud.laz, trajectory.csv, quality.json, pictures"
 
@@ -93,15 +94,44 @@ def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
     from groundproc.survey import Survey
 
     first: Path = arguments.logs[0]
+    _expect(arguments)
     if arguments.output is not None:
         return Request(arguments.logs, _survey(arguments, Survey()), arguments.trajectory), arguments.output
     if len(arguments.logs) > 1 or not first.is_dir():
-        raise UsageError("-o DIR is missing: the folder of the products")
+        raise UsageError("-o DIR is missing: the folder of the products; expected swath process LOG... -o DIR")
     before = remembered(first)
     if before is None:
         raise UsageError(f"{first}: no products of `swath process` in this folder; expected LOG... -o DIR")
     again = replace(before, survey=_survey(arguments, before.survey), poses=arguments.trajectory or before.poses)
     return again, first
+
+
+def _expect(arguments: argparse.Namespace) -> None:
+    """Refuse what is known to be another kind of file than it should be."""
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
+
+    goes_on = arguments.output is None and len(arguments.logs) == 1
+    expect(arguments.logs, (*LOG, "products", "folder") if goes_on else LOG, LOG_WORDS)
+    expect_text(arguments.config, "a survey file (YAML)")
+    expect([arguments.trajectory], ("poses", "products", "folder"), "a folder of products or a trajectory.csv")
+
+
+def _expect_named(survey: Survey) -> None:
+    """The same for the files that a survey names."""
+    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
+    from groundproc.sensors.lasers import ESTIMATE
+
+    lasers = None if survey.lasers == ESTIMATE else survey.lasers
+    mount = survey.mount if isinstance(survey.mount, str) else None
+    expect_text(mount, "a mount file (YAML)")
+    expect_text(survey.compass, "a file of `swath calibrate` or `swath compass` (YAML)")
+    expect_text(lasers, "a file of `swath calibrate --lasers` (YAML)")
+    for name, kinds, expected in (
+        (survey.positions, (*SOLUTIONS, "table", "text"), SOLUTION_WORDS),
+        (survey.control, ("control", "table", "text"), "a table of control points (CSV: x, y, z, sigma)"),
+    ):
+        if name is not None and Path(name).exists():  # one that is not there, its reader names
+            expect([name], kinds, expected)
 
 
 def _survey(arguments: argparse.Namespace, otherwise: Any) -> Any:
@@ -114,7 +144,9 @@ def _survey(arguments: argparse.Namespace, otherwise: Any) -> Any:
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else otherwise)
     if arguments.config:
         beside(tree, arguments.config.parent, FILES, (ESTIMATE,))
-    return config.from_mapping(tree | given_settings(arguments, SECTIONS), Survey, "command line")
+    survey = config.from_mapping(tree | given_settings(arguments, SECTIONS), Survey, "command line")
+    _expect_named(survey)
+    return survey
 
 
 def _status(request: Request, folder: Path, as_json: bool) -> int:

@@ -27,9 +27,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Recover, with a progress bar on a terminal."""
     from flightlog.salvage import examine, salvage
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.progress import stages
 
     log: Path = arguments.log
+    expect([log], LOG, LOG_WORDS)
     target: Path = arguments.output or log.with_name(f"{log.stem}.recovered.mcap")
     with stages([log], {"recover": "recovering"}) as progress:
         if arguments.output is None and examine(log).whole:

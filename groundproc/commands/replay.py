@@ -33,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Play, with a progress bar on a terminal."""
     from tqdm import tqdm
 
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.field.replay import Destination, Replayed, parse_mavlink, parse_speed, replay
 
     to = Destination(
@@ -43,6 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.link,
     )
     speed = parse_speed(arguments.speed)
+    expect(arguments.logs, LOG, LOG_WORDS)
 
     def once() -> Replayed:
         with tqdm(unit="s", leave=False, disable=not sys.stderr.isatty()) as bar:

@@ -13,7 +13,7 @@ from typing import Any
 
 from flightlog import config
 from flightlog.clock import utc_text
-from flightlog.errors import UsageError
+from flightlog.errors import ClockError, CoverageError, LogError, UsageError
 from groundproc.estimation.method import Progress
 from groundproc.files import made_folder
 from groundproc.steps import ORDER
@@ -103,9 +103,11 @@ def process(
             with Run(request, folder, progress) as run:
                 for step in steps()[: ORDER.index(until) + 1]:
                     _bring_up_to_date(step, run, ledger, force)
-        except Exception:  # raised again: whatever went wrong, a folder that held nothing is left so
+        except Exception as error:  # raised again: whatever went wrong, a folder that held nothing is left so
             if was_empty:
                 ledger.forget_all()
+            if isinstance(error, LogError | ClockError | CoverageError) and run.torn():
+                raise type(error)(f"{error} ({run.torn()})") from error
             raise
         finally:
             if not ledger.entries:

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import shlex
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -60,6 +61,13 @@ class Run:
         """The logs, in order of time; those of several flights are refused."""
         readers = [self._stack.enter_context(LogReader(path)) for path in self.request.logs]
         return in_order_of_one_flight(readers, self.survey.mount)
+
+    def torn(self) -> str:
+        """Which logs are cut off, in words: where a step fails, that may be why."""
+        torn = [reader.path for reader in self.__dict__.get("readers", ()) if reader.damage.truncated]
+        return "; ".join(
+            f"{path} is cut off: `swath recover {shlex.quote(str(path))}` saves what is left" for path in torn
+        )
 
     @cached_property
     def mount_and_source(self) -> tuple[Mount, str]:
