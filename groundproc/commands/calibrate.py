@@ -17,6 +17,8 @@ HELP = "find boresight, lever arm, clock offset, compass curve and corrections o
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="flight logs, each a flight of its own")
     parser.add_argument(
         "-o",
@@ -32,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="find range and elevation offsets of the 32 lasers as well: lasers.yaml, lasers.png",
     )
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print what calibration.json holds")
 
 
@@ -42,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     from flightlog.errors import UsageError
     from flightlog.logfile import LogReader
     from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
+    from groundproc.commands.outputs import claim_folder
     from groundproc.estimation.calibration.compass import write_compass
     from groundproc.estimation.calibration.mount import calibrate
     from groundproc.files import made_folder, written_aside
@@ -56,6 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("a log is named twice; its flight would count twice")
     expect(logs, LOG, LOG_WORDS)
     expect_text(arguments.mount, "a mount file (YAML)")
+    names = (
+        "mount.yaml",
+        "compass.yaml",
+        "calibration.json",
+        *(("lasers.yaml", "lasers.png") if arguments.lasers else ()),
+    )
+    claim_folder(arguments.output, names, arguments.force)
     with LogReader(logs[0]) as reader:
         nominal, _ = find_mount(str(arguments.mount) if arguments.mount else None, [reader])
         lasers = lidar_of([reader]).lasers

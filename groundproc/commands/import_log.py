@@ -9,6 +9,8 @@ HELP = "make a flight log of pcap captures and an autopilot's logs, or of a line
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument(
         "--pcap", nargs="+", action="extend", default=[], type=Path, metavar="FILE",
         help="captures of the lidar (pcap, pcapng), in any order",
@@ -32,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--mount", type=Path, metavar="YAML", help="how the lidar was mounted; goes into the log")
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="LOG.mcap", help="the log to write")
-    parser.add_argument("--force", action="store_true", help="replace the output where it exists")
+    add_force(parser)
     parser.add_argument("--lidar-port", type=int, default=2368, metavar="N", help="UDP port of the data packets")
     parser.add_argument("--position-port", type=int, default=8308, metavar="N", help="UDP port of the position packets")
 
@@ -40,11 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Import and say what was found."""
     from flightlog.errors import UsageError
+    from groundproc.commands.outputs import claim_file
 
     kit = (arguments.scans, arguments.imu, arguments.positions)
     if any(kit) == bool(arguments.pcap) or (any(kit) and not all(kit)):
         raise UsageError("import: give --pcap, or all of --scans, --imu and --positions")
     _expect(arguments)
+    claim_file(arguments.output, (".mcap",), arguments.force, (*arguments.pcap, *arguments.mavlink))
     return _kit(arguments) if all(kit) else _captures(arguments)
 
 

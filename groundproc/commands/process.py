@@ -43,9 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--until", choices=ORDER, metavar="STEP", help=f"stop after this step: {', '.join(ORDER)}")
     parser.add_argument("--status", action="store_true", help="say what is there and what is to be done, and why")
-    parser.add_argument(
-        "--force", action="store_true", help="do every step again, and write over files that are not ours"
-    )
+    parser.add_argument("--force", action="store_true", help="do every step again, and write over files that are there")
     parser.add_argument("--json", action="store_true", help="print what quality.json holds")
 
 
@@ -91,7 +89,7 @@ def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
     from flightlog.errors import UsageError
     from groundproc.steps.process import remembered
     from groundproc.steps.request import Request
-    from groundproc.survey import Survey
+    from groundproc.survey import Survey, TrajectorySettings
 
     first: Path = arguments.logs[0]
     _expect(arguments)
@@ -102,8 +100,13 @@ def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
     before = remembered(first)
     if before is None:
         raise UsageError(f"{first}: no products of `swath process` in this folder; expected LOG... -o DIR")
-    again = replace(before, survey=_survey(arguments, before.survey), poses=arguments.trajectory or before.poses)
-    return again, first
+    chosen = before.survey
+    if (
+        arguments.trajectory is not None
+    ):  # what a trajectory was estimated with before is of no use for one from elsewhere
+        plain = {name: value for name, value in vars(TrajectorySettings()).items() if name != "lasers"}
+        chosen = replace(chosen, **plain)
+    return replace(before, survey=_survey(arguments, chosen), poses=arguments.trajectory or before.poses), first
 
 
 def _expect(arguments: argparse.Namespace) -> None:

@@ -158,7 +158,9 @@ def _refuse_foreign(ledger: Ledger, outputs: Sequence[str]) -> None:
     owned = ledger.owned()
     for name in outputs:
         if name not in owned and (ledger.folder / name).exists():
-            raise UsageError(f"{ledger.folder / name}: is there and was not made by this; --force replaces it")
+            raise UsageError(
+                f"{ledger.folder / name}: exists already and was not made by this; give another folder, or --force to write over it"
+            )
 
 
 # What is to be done ---------------------------------------------------------------------------------------------------

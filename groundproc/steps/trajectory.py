@@ -58,8 +58,15 @@ def check(request: Request) -> None:
     chosen_corrections(request.survey)
     if request.poses is None:
         methods.check(request.survey)
-    elif request.survey.lasers == ESTIMATE:
+        return
+    if request.survey.lasers == ESTIMATE:
         raise UsageError("lasers: estimate given, but with a trajectory from elsewhere nothing is estimated")
+    plain = section(Survey(), TrajectorySettings)
+    for name, value in section(request.survey, TrajectorySettings).items():
+        if name != "lasers" and value != plain[name]:
+            raise UsageError(
+                f"{name}: {value} given, but nothing uses it: with a trajectory from elsewhere nothing is estimated"
+            )
 
 
 def work(run: Run, folders: Folders) -> None:

@@ -577,6 +577,8 @@ def test_a_folder_that_cannot_be_written_is_refused(
         (["--fov", "wide"], 2, "wide"),
         (["--sync", "gyro"], 1, "gyro"),
         (["--trajectory", "nowhere.csv"], 1, "nowhere.csv"),
+        (["--trajectory", ".", "--causal"], 2, "causal: True given, but nothing uses it"),
+        (["--trajectory", ".", "--positions", "nowhere.pos"], 2, "positions: nowhere.pos given, but nothing uses it"),
         (["--config", "nowhere.yaml"], 2, "nowhere.yaml"),
         (["--mount", "nowhere.yaml"], 2, "nowhere.yaml"),
     ],

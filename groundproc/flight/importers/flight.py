@@ -84,6 +84,7 @@ def import_flight(
             sources.append(open_mavlink(path, LINK))
         partial = output.with_name(f".{output.name}.partial")
         try:
+            output.parent.mkdir(parents=True, exist_ok=True)
             with partial.open("wb") as stream:
                 result = _write(stream, sources, attachments, progress)
                 stream.flush()

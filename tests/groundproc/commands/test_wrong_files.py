@@ -145,9 +145,7 @@ def test_every_option_that_takes_a_file_tells_what_else_it_is(
 
 
 def test_prose_with_colons_is_no_survey(folder: Path) -> None:
-    (folder / "prose").write_text("Dear pilot: read this
-method: take off
-")
+    (folder / "prose").write_text("Dear pilot: read this\nmethod: take off\n")
     kind = kind_of(folder / "prose")
     assert kind is not None
     assert kind.name == "text"
