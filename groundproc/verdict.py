@@ -4,6 +4,7 @@ A rule looks at figures and gives its reasons; `LOG_RULES` judge what `swath inf
 Whatever says `warning` or `warnings` anywhere in the figures is a reason too, so that who finds something new need only write it there.
 """
 
+import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -28,8 +29,10 @@ GAP_S: Final = 1.0
 """Attitudes are bridged over so long; over a longer silence there is no pose."""
 LEAST_S: Final = 2.0
 """Without so much in common no clock of one can be tied to the other's."""
-SYNC_S: Final = 0.005
-"""In this time a turn of 30 deg/s, brisk for a survey, moves the lidar's beam by its own width, 2.8 mrad."""
+BEAM_MRAD: Final = 2.8
+"""Width of the HDL-32E's beam: what the error of the clocks' tie may put it off by in the turns of the flight."""
+USUAL_TURN_DEG_S: Final = 30.0
+"""Of a multirotor in a brisk survey, where the turns of the flight are not stated."""
 SYNC_HOPELESS_S: Final = 0.5
 """Half of the time in which a multirotor's attitude changes: a pose belongs to another manoeuvre than its shots."""
 POSITION_M: Final = (10.0, 15.0)
@@ -250,14 +253,15 @@ def _clocks(quality: Figures) -> Iterator[Reason]:
     if worst is None:
         return
     sigma_s = worst["sigma_s"]
-    if sigma_s > SYNC_S:
-        grade = BAD if sigma_s > SYNC_HOPELESS_S else DOUBTFUL
+    rate_deg_s = quality["trajectory"].get("turn_rate_deg_s", USUAL_TURN_DEG_S)
+    off_mrad = sigma_s * math.radians(rate_deg_s) * 1e3
+    if off_mrad > BEAM_MRAD or sigma_s > SYNC_HOPELESS_S:
         why = f" ({worst['note']})" if worst["note"] else ""
         yield Reason(
-            grade,
+            BAD if sigma_s > SYNC_HOPELESS_S else DOUBTFUL,
             "sync",
-            f"lidar and autopilot are tied by {worst['method']} to {sigma_s * 1e3:,.0f} ms only, expected "
-            f"{SYNC_S * 1e3:.0f} ms or better{why}",
+            f"lidar and autopilot are tied by {worst['method']} to {sigma_s * 1e3:,.0f} ms only, by which turns of "
+            f"{rate_deg_s:.0f} deg/s put the beam {off_mrad:.1f} mrad off, expected {BEAM_MRAD:g} or less{why}",
         )
     if any(leg["utc"]["source"] == "host" for leg in quality["legs"]):
         yield Reason(DOUBTFUL, "utc", "no GNSS time in the log: UTC is what the recording computer's clock said")
@@ -286,7 +290,8 @@ def _trajectory(quality: Figures) -> Iterator[Reason]:
 def _position(sigma_m: Sequence[float], what: str, hopeless: bool) -> Reason | None:
     """What a sigma of east, north and up says of the positions."""
     plan_m, height_m = max(sigma_m[:2]), sigma_m[2]
-    if plan_m <= POSITION_M[0] and height_m <= POSITION_M[1]:
+    # a sigma that nobody stated is not a number, and no reason
+    if not (plan_m > POSITION_M[0] or height_m > POSITION_M[1]):
         return None
     grade = BAD if hopeless and max(plan_m, height_m) > POSITION_HOPELESS_M else DOUBTFUL
     return Reason(

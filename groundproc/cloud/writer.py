@@ -1,5 +1,6 @@
 """Clouds as LAZ: LAS 1.4, point format 6 to 8, made from the table of dimensions and compressed on all cores."""
 
+import contextlib
 import queue
 import threading
 from collections.abc import Iterable, Sequence
@@ -20,6 +21,7 @@ from flightlog.errors import SourceError
 from groundproc.cloud.dimensions import BIT_FIELDS, Dimension, in_order
 from groundproc.cloud.gpstime import gps_time_s
 from groundproc.cloud.points import Points
+from groundproc.cloud.storing import storing
 
 SCALE_M: Final = 0.001
 BUFFER_POINTS: Final = 20 * 50_000
@@ -98,9 +100,11 @@ class CloudWriter:
         self._thread.join()
         if self._error is None:
             self._state_totals(self._las.header)
-            self._las.close()
+            with storing(self._path):
+                self._las.close()
         else:
-            self._las.dest.close()
+            with contextlib.suppress(OSError):  # on a full disk closing fails as well
+                self._las.dest.close()
         if self._error is not None and error is None:
             raise self._error
 
@@ -161,7 +165,9 @@ class CloudWriter:
             try:
                 # not its write_points(): that sorts all return numbers for the header, a tenth of the time of the whole pipeline
                 if self._error is None and len(points):
-                    self._las.point_writer.write_points(laspy.PackedPointRecord(points, self._las.header.point_format))
+                    with storing(self._path):
+                        record = laspy.PackedPointRecord(points, self._las.header.point_format)
+                        self._las.point_writer.write_points(record)
             except BaseException as error:  # handed to the producer, whatever it is
                 self._error = error
             self._free.put(points)  # also after an error, so that the producer never waits for a dead thread

@@ -13,7 +13,7 @@ from typing import Any
 
 from flightlog import config
 from flightlog.clock import utc_text
-from flightlog.errors import ClockError, CoverageError, LogError, UsageError
+from flightlog.errors import ClockError, CoverageError, LogError, SourceError, UsageError
 from groundproc.estimation.method import Progress
 from groundproc.files import made_folder
 from groundproc.steps import ORDER
@@ -108,6 +108,8 @@ def process(
                 ledger.forget_all()
             if isinstance(error, LogError | ClockError | CoverageError) and run.torn():
                 raise type(error)(f"{error} ({run.torn()})") from error
+            if isinstance(error, OSError):
+                raise SourceError(f"{error.filename or folder}: {error.strerror or error}") from error
             raise
         finally:
             if not ledger.entries:

@@ -15,6 +15,7 @@ from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import SECTIONS, Survey, section
 from groundproc.trajectory.estimate import Estimate
+from groundproc.trajectory.trajectory import Trajectory
 from groundproc.verdict import judge_flight
 
 
@@ -62,6 +63,7 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
             "gaps_s": float(seconds[~trajectory.covered[:-1]].sum()),
             "median_sigma_m": np.median(trajectory.sigma_position_m, axis=0).tolist(),
             "largest_sigma_m": np.max(trajectory.sigma_position_m, axis=0).tolist(),
+            "turn_rate_deg_s": turn_rate_deg_s(trajectory),
             "sigma_source": made.sigma_source,
             "note": made.note,
             "warning": made.warning,
@@ -70,6 +72,11 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
         "lidar": placed["lidar"],
         "points": placed["points"],
     }
+
+
+def turn_rate_deg_s(trajectory: Trajectory) -> float:
+    """What 19 of 20 knots turn slower than [deg/s]."""
+    return float(np.rad2deg(np.percentile(np.linalg.norm(trajectory.rate_rad_s, axis=1), 95.0)))
 
 
 def describe_mount(made: Estimate) -> dict[str, Any]:

@@ -45,6 +45,7 @@ FLIGHT: Figures = {
         "gaps_s": 0.0,
         "median_sigma_m": [3.0, 3.0, 4.5],
         "largest_sigma_m": [3.0, 3.0, 4.5],
+        "turn_rate_deg_s": 40.0,
         "warning": "",
     },
     "mount": {"source": "log"},
@@ -122,7 +123,13 @@ def test_small_losses_and_what_is_not_known_are_no_reason(path: str, value: Any)
     [
         ("inputs/0/truncated", True, DOUBTFUL, "truncated", "swath recover a.mcap"),
         ("inputs/0/lost_bytes", 1234, DOUBTFUL, "damaged", "1,234 bytes"),
-        ("legs/0/sync/sigma_s", 0.02, DOUBTFUL, "sync", "to 20 ms only"),
+        (
+            "legs/0/sync/sigma_s",
+            0.02,
+            DOUBTFUL,
+            "sync",
+            "to 20 ms only, by which turns of 40 deg/s put the beam 14.0 mrad off",
+        ),
         ("legs/0/sync/sigma_s", 168.0, BAD, "sync", "to 168,000 ms only"),
         ("legs/0/utc/source", "host", DOUBTFUL, "utc", "recording computer"),
         ("legs/0/gps_after_first_fix/without", 9, DOUBTFUL, "gnss", "10% of the time"),
@@ -144,6 +151,17 @@ def test_each_fault_of_a_flight_is_a_reason(path: str, value: Any, grade: str, a
     found = judge_flight(changed(FLIGHT, path, value))
     assert (found.grade, [reason.about for reason in found.reasons]) == (grade, [about])
     assert words in found.line()
+
+
+def test_a_coarse_tie_is_enough_for_a_sensor_that_hardly_turns() -> None:
+    """9 ms of receive times: 6.3 mrad at 40 deg/s, but 0.3 at 2, where the beam is 2.8 wide."""
+    coarse = changed(FLIGHT, "legs/0/sync/sigma_s", 0.009)
+    assert judge_flight(coarse).grade == DOUBTFUL
+    assert judge_flight(changed(coarse, "trajectory/turn_rate_deg_s", 2.0)).grade == GOOD
+
+
+def test_a_sigma_that_nobody_stated_is_no_reason() -> None:
+    assert judge_flight(changed(FLIGHT, "trajectory/median_sigma_m", [float("nan")] * 3)).grade == GOOD
 
 
 def test_a_warning_anywhere_in_the_figures_is_a_reason_whoever_wrote_it() -> None:
