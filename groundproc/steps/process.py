@@ -5,7 +5,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -13,7 +13,7 @@ from typing import Any
 
 from flightlog import config
 from flightlog.clock import utc_text
-from flightlog.errors import ClockError, CoverageError, LogError, SourceError, UsageError
+from flightlog.errors import ClockError, CoverageError, LogError, SourceError, SwathError, UsageError
 from groundproc.estimation.method import Progress
 from groundproc.files import made_folder
 from groundproc.steps import ORDER
@@ -145,8 +145,17 @@ def _execute(step: Step, parts: Sequence[str], run: Run, ledger: Ledger, force: 
         with undisturbed():
             for part, place in folders.items():
                 ledger.commit(step.unit(part), Entry(keys[part], outputs[part], finished, seconds), place)
+    except SwathError as error:
+        raise type(error)(_in_place(str(error), folders, ledger.folder)) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
+
+
+def _in_place(sentence: str, folders: Mapping[str, Path], target: Path) -> str:
+    """A sentence about a file being made, with the name that the user knows it by."""
+    for place in folders.values():
+        sentence = sentence.replace(str(place), str(target))
+    return sentence
 
 
 def _fingerprints(folder: Path) -> dict[str, Fingerprint]:

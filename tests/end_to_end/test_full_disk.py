@@ -1,4 +1,4 @@
-"""A full disk and a signal in the middle of the work: one sentence, the right exit code, and nothing left. The disks are real: tmpfs, root."""
+"""A full disk and a signal in the middle of the work: one sentence, the right exit code, nothing left; real disks (tmpfs, root)."""
 
 import os
 import shutil
