@@ -145,7 +145,7 @@ def _percent(share: float) -> str:
 # One log --------------------------------------------------------------------------------------------------------------
 
 
-def _damage(log: str, end: str | None, truncated: bool, lost_bytes: int, pieces: int) -> Iterator[Reason]:
+def damage_of(log: str, end: str | None, truncated: bool, lost_bytes: int, pieces: int) -> Iterator[Reason]:
     """What is missing of a log, and what mends it."""
     mends = f"`swath recover {shlex.quote(log)}` makes a whole log of the rest"
     torn = f", {lost_bytes:,} bytes of it cannot be read" if lost_bytes else ""
@@ -158,7 +158,7 @@ def _damage(log: str, end: str | None, truncated: bool, lost_bytes: int, pieces:
 
 def _log_damage(summary: Figures) -> Iterator[Reason]:
     damage = summary["damage"]
-    yield from _damage(
+    yield from damage_of(
         summary["file"], summary["end_utc"], summary["truncated"], damage["lost_bytes"], damage["bad_chunks"]
     )
     if summary["messages_damaged"]:
@@ -245,7 +245,7 @@ LOG_RULES: Final[tuple[Rule, ...]] = (_log_damage, _log_lidar, _log_autopilot, _
 
 def _inputs(quality: Figures) -> Iterator[Reason]:
     for log in quality["inputs"]:
-        yield from _damage(log["file"], log["end"], log["truncated"], log["lost_bytes"], log["bad_chunks"])
+        yield from damage_of(log["file"], log["end"], log["truncated"], log["lost_bytes"], log["bad_chunks"])
 
 
 def _clocks(quality: Figures) -> Iterator[Reason]:

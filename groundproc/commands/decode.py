@@ -25,12 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Decode, with a progress bar on a terminal."""
     from flightlog.errors import UsageError
-    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, told_damage
     from groundproc.commands.outputs import claim_file
     from groundproc.commands.values import field_of_view
     from groundproc.products.sensor_cloud import write_sensor_cloud
     from groundproc.progress import stages
     from groundproc.sensors.shots import Gate
+    from groundproc.verdict import DOUBTFUL, EXIT_CODES, GOOD
 
     if not 0.0 <= arguments.min_range <= arguments.max_range:
         raise UsageError(
@@ -42,4 +43,4 @@ def run(arguments: argparse.Namespace) -> int:
     with stages(arguments.logs, {"decode": "points"}) as progress:
         cloud = write_sensor_cloud(arguments.logs, arguments.output, gate, lambda done: progress("decode", done))
     print(f"{cloud.points:,} points in {arguments.output}, {cloud.time_scale}")
-    return 0
+    return EXIT_CODES[DOUBTFUL if told_damage(arguments.logs) else GOOD]

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the log but for its points, and write."""
-    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, told_damage
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
     from groundproc.progress import stages
@@ -31,6 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     expect(arguments.logs, LOG, LOG_WORDS)
     with stages(arguments.logs, {"read": "clocks and autopilot"}) as progress:
         survey, notes, head = facts(arguments.logs, progress)
+    told_damage(arguments.logs)
     text = sample(survey, notes, head)
     if path is None:
         print(text, end="")

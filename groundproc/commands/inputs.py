@@ -1,6 +1,7 @@
 """Files that a command is given: that they are there and of the kind that it takes, before the work begins."""
 
 import difflib
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -58,6 +59,22 @@ def expect_text(path: Path | str | None, expected: str) -> None:
         expect([path], YAML, expected)
     except CaptureError as error:
         raise ConfigError(str(error)) from None
+
+
+def told_damage(logs: Iterable[Path]) -> bool:
+    """Say on the terminal which logs are cut off or damaged, and what mends them; whether any is."""
+    from flightlog.clock import utc_text
+    from flightlog.logfile import LogReader
+    from groundproc.verdict import damage_of
+
+    told = False
+    for path in logs:
+        with LogReader(path) as log:
+            damage, end = log.damage, utc_text(log.end_ns) if log.end_ns else None
+            for reason in damage_of(str(path), end, damage.truncated, damage.lost_bytes, damage.bad_chunks):
+                print(f"swath: warning: {reason.text}", file=sys.stderr)
+                told = True
+    return told
 
 
 def like(path: Path) -> str:

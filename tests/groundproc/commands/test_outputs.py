@@ -90,7 +90,7 @@ def test_every_command_that_writes_takes_force(capsys: pytest.CaptureFixture[str
 def test_with_force_it_is_written_over_and_folders_that_are_missing_are_made(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_flight(folder / "l.mcap", 2.0)
+    write_flight(folder / "l.mcap", 4.0)
     for words, name in (
         (["decode", "l.mcap", "-o"], "scan.laz"),
         (["recover", "l.mcap", "-o"], "whole.mcap"),
