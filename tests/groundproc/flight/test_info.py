@@ -264,5 +264,5 @@ def test_the_keys_of_the_json_are_these(monterey_log: Path) -> None:
 def test_a_file_that_is_no_log_is_one_sentence(recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(recordings / "lidar/hdl32e_monterey.pcap")]) == 1
     error = capsys.readouterr().err
-    assert "is no MCAP file" in error
+    assert "is a packet capture" in error
     assert error.count("\n") == 1
