@@ -34,7 +34,11 @@ FOUND: Final = f"{INSIDE}/place.json"
 def settings(request: Request) -> Mapping[str, Any]:
     """The window of shots, the CRS, and what heights refer to."""
     survey = request.survey
-    return section(survey, PlacingSettings) | {"crs": survey.crs, "height": survey.height}
+    return section(survey, PlacingSettings) | {
+        "crs": survey.crs,
+        "crs_anyway": survey.crs_anyway,
+        "height": survey.height,
+    }
 
 
 def parts(request: Request) -> Mapping[str, Any]:
