@@ -17,7 +17,7 @@ from groundproc.cli import main
 from groundproc.field.madeup import write_flight
 
 SWATH = (sys.executable, "-c", "import sys; from groundproc.cli import main; sys.exit(main())")
-PATIENCE_S = 300.0
+PATIENCE_S = 600.0
 TERMINATED, INTERRUPTED = 143, 130
 
 
