@@ -36,13 +36,13 @@ def claim_file(path: Path, suffixes: Sequence[str], force: bool, inputs: Iterabl
         raise UsageError(
             f"{path}: is a folder, expected the name of a file to write, such as {path / f'NAME{suffixes[0]}'}"
         )
+    if any(path.resolve() == other.resolve() for other in inputs):
+        raise UsageError(f"{path}: is an input and cannot be the output too")
     if path.suffix.lower() not in suffixes:
         raise UsageError(
             f"{path}: ends in {path.suffix or 'nothing'}, expected a name that ends in {' or '.join(suffixes)}, such as "
             f"{path.with_suffix(suffixes[0]) if path.name else f'NAME{suffixes[0]}'}"
         )
-    if any(path.resolve() == other.resolve() for other in inputs):
-        raise UsageError(f"{path}: is an input and cannot be the output too")
     _refuse(path, force)
 
 
