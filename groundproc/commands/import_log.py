@@ -57,7 +57,7 @@ def _expect(arguments: argparse.Namespace) -> None:
     from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
 
     expect(arguments.pcap, ("capture", "gzip", "empty", "text", "yaml"), "captures of the lidar (pcap, pcapng)")
-    mavlink = ("tlog", "dataflash", "mavlink", "gzip", "empty", "text", "yaml")
+    mavlink = ("tlog", "dataflash", "mavlink", "gzip", "empty", "text", "table", "yaml")
     expect(arguments.mavlink, mavlink, "recordings of the autopilot (.tlog, dataflash .bin)")
     expect([arguments.scans], ("scans", "table", "archive", "gzip", "text"), "lines of a line scanner (CSV or NPZ)")
     expect([arguments.imu], ("imu", "table", "gzip", "text"), "samples of an IMU (CSV)")
