@@ -55,7 +55,7 @@ _TAIL: Final = """\
 |---|---|
 | `swath.log` | `format_version`. A reader refuses a version above its own, and reads every one below. |
 | `swath.topics` | What channel number means which topic, and `crc32` of that, at the flushes number 1, 2, 4, 8 and so on: see below. |
-| `swath.session` | Who wrote the log, which version, where or of which files ([importing.md](importing.md)); `lidar`: [model](sensors.md). |
+| `swath.session` | Who wrote it, which version, where or of which files ([importing.md](importing.md)); `lidar`: [model](sensors.md). |
 
 Of a name that occurs more than once, the last one counts. MCAP itself says the channel numbers in the first chunk and in the summary
 only; with `swath.topics` a log that was cut off and lost its first chunk can still be read.

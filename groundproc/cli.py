@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import os
+import re
 import signal
 import sys
 import threading
@@ -10,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
 
 GROUP: Final = "swath.commands"
 OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
@@ -23,6 +24,29 @@ _BROKEN_PIPE: Final = 128 + signal.SIGPIPE
 def commands() -> dict[str, EntryPoint]:
     """All commands that installed packages offer, by name."""
     return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong with a command line in one sentence, and what was perhaps meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with the sentence."""
+        self.exit(2, f"{self.prog}: {message}{self._meant(message)}; `{self.prog} --help` lists all\n")
+
+    def _meant(self, message: str) -> str:
+        """The nearest of what could have been typed, in words."""
+        import difflib
+
+        if found := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
+            typed, known = [found[1]], re.findall(r"'([^']*)'|([\w.-]+)", found[2])
+            names = [quoted or plain for quoted, plain in known]
+        elif message.startswith("unrecognized arguments: "):
+            typed = [word.partition("=")[0] for word in message.split()[2:] if word.startswith("-")]
+            names = list(self._option_string_actions)
+        else:
+            return ""
+        near = [name for word in typed for name in difflib.get_close_matches(word, names, 1, 0.6)]
+        return f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
 
 
 class Terminated(KeyboardInterrupt):
@@ -84,13 +108,15 @@ def _outside(error: Exception) -> tuple[str, int]:
 
 def _dispatch(words: list[str]) -> int:
     found = commands()
+    if words[:1] == ["help"]:  # as many programs have it
+        words = [*words[1:2], "--help"]
     if words and words[0] in found:
         point = found[words[0]]
         module = point.load()
-        parser = argparse.ArgumentParser(prog=f"swath {point.name}", description=module.HELP)
+        parser = Parser(prog=f"swath {point.name}", description=module.HELP)
         module.add_arguments(parser)
         return int(module.run(parser.parse_args(words[1:])))
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="swath",
         description="Turns flight logs into point clouds.",
         epilog=_listing(found) if not words or {"-h", "--help"} & set(words) else None,

@@ -5,12 +5,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from flightlog.errors import SourceError
+from flightlog.errors import SourceError, SwathError
 
 
 @contextlib.contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
     """Give a name beside `path` to write to; on leaving it becomes `path`, on an error it is removed.
+
+    Folders above it that are missing are made, and go again where nothing came of it.
 
     Raises
     ------
@@ -18,14 +20,23 @@ def written_aside(path: Path) -> Iterator[Path]:
         The place cannot be written to.
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    made = [folder for folder in path.parents if not folder.exists()]
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield aside
         aside.replace(path)
+        made = []
     except OSError as error:
         raise SourceError(f"{path}: cannot be written ({error.strerror or error})") from None
+    except SwathError as error:
+        if str(aside) not in str(error):
+            raise
+        raise type(error)(str(error).replace(str(aside), str(path))) from None
     finally:
         with contextlib.suppress(OSError):
             aside.unlink(missing_ok=True)
+            for folder in made:
+                folder.rmdir()
 
 
 @contextlib.contextmanager
@@ -37,14 +48,14 @@ def made_folder(path: Path) -> Iterator[None]:
     SourceError
         It cannot be made or written to.
     """
-    was_there = path.is_dir()
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
     make_folder(path)
     try:
         yield
     except BaseException:
-        if not was_there:
-            with contextlib.suppress(OSError):
-                path.rmdir()
+        with contextlib.suppress(OSError):
+            for folder in made:
+                folder.rmdir()
         raise
 
 

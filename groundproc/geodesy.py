@@ -21,6 +21,8 @@ Array = npt.NDArray[np.float64]
 
 LARGEST_RESIDUAL_M: Final = 1e-4
 """What the polynomial of a chunk may differ from PROJ [m]; a lidar range step is 2 mm."""
+AREA_SLACK_DEG: Final = 0.01
+"""Areas of use are stated to so much."""
 LARGEST_UNDULATION_M: Final = 120.0
 """The geoid lies between -107 m and +86 m of the ellipsoid (EGM 96)."""
 
@@ -100,6 +102,59 @@ def projected_crs(code: int | str) -> pyproj.CRS:
             "heights are chosen with --height"
         )
     return crs
+
+
+def check_area(crs: pyproj.CRS, latitude_deg: npt.ArrayLike, longitude_deg: npt.ArrayLike) -> None:
+    """See that a CRS is made for where a flight was: elsewhere it gives coordinates that are wrong by its distortion, or in the millions.
+
+    Parameters
+    ----------
+    crs : pyproj.CRS
+        One that states no area of use holds for every place.
+    latitude_deg, longitude_deg : array_like, shape (n,) or scalars
+        WGS 84.
+
+    Raises
+    ------
+    GeodesyError
+        A place lies outside; with the UTM zone that holds it.
+    """
+    area = crs.area_of_use
+    if area is None:
+        return
+    latitude, longitude = np.atleast_1d(latitude_deg), np.atleast_1d(longitude_deg)
+    # eastwards from the western edge: an area may lie across the 180th meridian
+    width_deg = (area.east - area.west) % 360.0 or 360.0
+    across_deg = (longitude - area.west + AREA_SLACK_DEG) % 360.0
+    holds = (latitude >= area.south - AREA_SLACK_DEG) & (latitude <= area.north + AREA_SLACK_DEG)
+    holds &= across_deg <= width_deg + 2.0 * AREA_SLACK_DEG
+    if holds.all():
+        return
+    out = int(np.argmin(holds))
+    place = float(latitude[out]), float(longitude[out])
+    raise GeodesyError(
+        f"{_name(crs)}: is made for {_degrees(area.south, 'N', 'S')} to {_degrees(area.north, 'N', 'S')} and "
+        f"{_degrees(area.west, 'E', 'W')} to {_degrees(area.east, 'E', 'W')}, but the flight was at "
+        f"{_degrees(place[0], 'N', 'S')}, {_degrees(place[1], 'E', 'W')}{_zone(*place)}; --crs-anyway takes it all the same"
+    )
+
+
+def _name(crs: pyproj.CRS) -> str:
+    code = crs.to_epsg()
+    return f"EPSG:{code} ({crs.name})" if code else str(crs.name)
+
+
+def _degrees(value: float, positive: str, negative: str) -> str:
+    return f"{abs(value):.4g} {positive if value >= 0 else negative}"
+
+
+def _zone(latitude_deg: float, longitude_deg: float) -> str:
+    """Which UTM zone holds a place, in words."""
+    try:
+        code = utm_epsg(latitude_deg, longitude_deg)
+    except GeodesyError:
+        return ""
+    return f", which EPSG:{code} ({projected_crs(code).name}) holds"
 
 
 def with_sea_level(crs: pyproj.CRS) -> pyproj.CRS:

@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, metavar="S", help="seconds of flight (20)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same bytes (1)")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for what is written")
+    parser.add_argument("--force", action="store_true", help="write over files that are there")
     parser.add_argument(
         "--config", type=Path, metavar="YAML", help="options, also of a flight; --sample-config shows all"
     )
@@ -70,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.output is None:
         raise UsageError("no folder to write to; say -o DIR")
     plan = _plan(arguments)
+    _claim(arguments)
     job = Job(
         plan.scene,
         plan.duration_s,
@@ -96,6 +98,19 @@ def run(arguments: argparse.Namespace) -> int:
             f"at most {played.worst_late_s * 1e3:.1f} ms late"
         )
     return 0
+
+
+def _claim(arguments: argparse.Namespace) -> None:
+    """Refuse to write over a flight that is there, and options that would not be used."""
+    from flightlog.errors import UsageError
+    from simulator.render import CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH
+
+    for name in (LOG, CAPTURE, TLOG, POSES, TRUTH, *([POINTS] if arguments.truth_points else ())):
+        path = arguments.output / name
+        if path.exists() and not arguments.force:
+            raise UsageError(f"{path}: exists already; give another name, or --force to write over it")
+    if arguments.pty_link is not None and not arguments.live:
+        raise UsageError("--pty-link given, but nothing uses it without --live")
 
 
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"

@@ -7,7 +7,7 @@ import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -222,6 +222,7 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
     names = [LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH] + [POINTS] * job.truth_points
     parts = {name: job.directory / f"{name}.part" for name in names}
     simulation = Simulation(job)
+    made = [folder for folder in (job.directory, *job.directory.parents) if not folder.exists()]
     try:
         job.directory.mkdir(parents=True, exist_ok=True)
         try:
@@ -234,9 +235,13 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
             write_json(parts[TRUTH], simulation.truth())
             for name, part in parts.items():
                 part.replace(job.directory / name)
+            made = []
         finally:
             for part in parts.values():
                 part.unlink(missing_ok=True)
+            with suppress(OSError):  # folders that nothing came into go again
+                for folder in made:
+                    folder.rmdir()
     except OSError as error:
         raise SwathError(f"{error.filename or job.directory}: cannot be written ({error.strerror})") from None
     return simulation

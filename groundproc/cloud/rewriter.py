@@ -1,5 +1,6 @@
 """A cloud written anew: same points, attributes, order, header and records, other coordinates."""
 
+import contextlib
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -10,6 +11,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CaptureError, SourceError
 from groundproc.cloud.reader import Cloud, opened
+from groundproc.cloud.storing import storing
 
 Array = npt.NDArray[np.float64]
 
@@ -65,9 +67,14 @@ class Rewriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is None and self._evlrs:
-            self._las.write_evlrs(laspy.vlrs.vlrlist.VLRList(self._evlrs))
-        self._las.close()
+        if error is not None:  # nothing of it is kept: what closing would still write may fail for the same reason
+            with contextlib.suppress(OSError):
+                self._las.dest.close()
+            return
+        with storing(self.path):
+            if self._evlrs:
+                self._las.write_evlrs(laspy.vlrs.vlrlist.VLRList(self._evlrs))
+            self._las.close()
 
     def write(self, record: Any, moved_m: Array) -> Array:
         """Append points moved by so much, shape (n, 3); gives their map coordinates as stored.
@@ -82,7 +89,8 @@ class Rewriter:
                 raise CaptureError(f"{self.name}: a corrected point lies beyond what its scale {step:g} can hold")
             record[name] = stored.astype(np.int32)
             places[:, axis] = stored * step + origin
-        self._las.write_points(record)
+        with storing(self.path):
+            self._las.write_points(record)
         return places
 
 

@@ -1,5 +1,6 @@
 """Clouds as LAZ, compressed on all cores."""
 
+import contextlib
 import queue
 import threading
 from collections.abc import Iterable, Sequence
@@ -15,6 +16,7 @@ import pyproj
 from flightlog.errors import SourceError
 from groundproc.cloud.packer import Packer
 from groundproc.cloud.points import Points
+from groundproc.cloud.storing import storing
 
 BUFFER_POINTS: Final = 20 * 50_000
 """lazrs compresses 50,000 points at a time on each core: a call of many such leaves no core idle at its end."""
@@ -57,6 +59,7 @@ class CloudWriter:
         gps: bool = True,
         about: str = "Velodyne HDL-32E",
     ) -> None:
+        self._path = path
         self._packer = Packer(path, columns, crs=crs, offset_m=offset_m, gps=gps, about=about)
         try:
             self._las = laspy.open(
@@ -84,9 +87,11 @@ class CloudWriter:
         self._thread.join()
         if self._error is None:
             self._packer.state_totals(self._las.header)
-            self._las.close()
+            with storing(self._path):
+                self._las.close()
         else:
-            self._las.dest.close()
+            with contextlib.suppress(OSError):  # on a full disk closing fails as well
+                self._las.dest.close()
         if self._error is not None and error is None:
             raise self._error
 
@@ -122,7 +127,9 @@ class CloudWriter:
             try:
                 # not its write_points(): that sorts all return numbers for the header, a tenth of the time of the whole pipeline
                 if self._error is None and len(points):
-                    self._las.point_writer.write_points(laspy.PackedPointRecord(points, self._las.header.point_format))
+                    with storing(self._path):
+                        record = laspy.PackedPointRecord(points, self._las.header.point_format)
+                        self._las.point_writer.write_points(record)
             except BaseException as error:  # handed to the producer, whatever it is
                 self._error = error
             self._free.put(points)  # also after an error, so that the producer never waits for a dead thread

@@ -11,6 +11,8 @@ HELP = "adjust the strips of a cloud of any origin: LAS files and a trajectory i
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("clouds", nargs="*", type=Path, metavar="LAS", help="LAS or LAZ files with gps_time")
     parser.add_argument(
         "-t",
@@ -20,7 +22,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="trajectory.csv, SBET, RTKLIB .pos or NMEA of the same flight",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder of the results")
+    add_force(parser)
     parser.add_argument("--crs", "--epsg", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
+    parser.add_argument(
+        "--crs-anyway", action="store_true", help="take the CRS where it is not made for the place of the flight"
+    )
     parser.add_argument("--week", type=int, metavar="N", help="GPS week, where the files have only seconds of it")
     parser.add_argument(
         "--geoid", type=float, default=0.0, metavar="N",
@@ -38,6 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog import config
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
+    from groundproc.commands.outputs import claim_folder
     from groundproc.geodesy import projected_crs
     from groundproc.strips.options import StripOptions
 
@@ -47,13 +55,21 @@ def run(arguments: argparse.Namespace) -> int:
     for given, name in ((arguments.clouds, "LAS"), (arguments.trajectory, "-t"), (arguments.output, "-o")):
         if not given:
             raise UsageError(f"{name} is missing; expected swath adjust LAS... -t TRAJECTORY -o DIR")
+    expect(arguments.clouds, ("cloud",), "LAS or LAZ files")
+    expect([arguments.trajectory], SOLUTIONS, SOLUTION_WORDS)
+    expect([arguments.control], ("control", "table"), "a table of control points (CSV: x, y, z, sigma)")
+    expect_text(arguments.config, "options as YAML")
     options = config.load(arguments.config, StripOptions) if arguments.config else StripOptions()
 
-    from groundproc.strips import work
+    from groundproc.strips import report, work
 
+    names = [path.with_suffix(".laz").name for path in arguments.clouds]
+    if all(path.resolve() != (arguments.output / path.with_suffix(".laz").name).resolve() for path in arguments.clouds):
+        claim_folder(arguments.output, (*names, *report.FILES), arguments.force)
     crs = None if arguments.crs is None else projected_crs(arguments.crs)
     task = work.Task(
-        arguments.clouds, arguments.trajectory, arguments.output, crs, arguments.week, arguments.geoid, arguments.control, options
+        arguments.clouds, arguments.trajectory, arguments.output, crs, arguments.week, arguments.geoid, arguments.control, options,
+        arguments.crs_anyway,
     )  # fmt: skip
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

@@ -17,6 +17,8 @@ HELP = "find boresight, lever arm, clock offset, compass curve and corrections o
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="flight logs, each a flight of its own")
     parser.add_argument(
         "-o",
@@ -32,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="find range and elevation offsets of the 32 lasers as well: lasers.yaml, lasers.png",
     )
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print what calibration.json holds")
 
 
@@ -41,6 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from flightlog.logfile import LogReader
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text, told_damage
+    from groundproc.commands.outputs import claim_folder
     from groundproc.estimation.calibration.compass import write_compass
     from groundproc.estimation.calibration.mount import calibrate
     from groundproc.files import made_folder, written_aside
@@ -53,6 +58,15 @@ def run(arguments: argparse.Namespace) -> int:
     logs = arguments.logs
     if len(set(logs)) < len(logs):
         raise UsageError("a log is named twice; its flight would count twice")
+    expect(logs, LOG, LOG_WORDS)
+    expect_text(arguments.mount, "a mount file (YAML)")
+    names = (
+        "mount.yaml",
+        "compass.yaml",
+        "calibration.json",
+        *(("lasers.yaml", "lasers.png") if arguments.lasers else ()),
+    )
+    claim_folder(arguments.output, names, arguments.force)
     with LogReader(logs[0]) as reader:
         nominal, _ = find_mount(str(arguments.mount) if arguments.mount else None, [reader])
         lasers = lidar_of([reader]).lasers
@@ -74,14 +88,24 @@ def run(arguments: argparse.Namespace) -> int:
         with written_aside(arguments.output / "calibration.json") as aside:
             aside.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(report, indent=2) if arguments.json else _text(report, arguments.output))
+    return _judged(result, told_damage(logs))
+
+
+def _judged(result: MountCalibration, torn: bool) -> int:
+    """Say what speaks against it, and give the exit code: bad where the flights contradict each other."""
+    from groundproc.verdict import BAD, DOUBTFUL, EXIT_CODES, GOOD
+
+    warned = [flight for flight in result.flights if flight.warning]
+    for flight in warned:
+        print(f"swath: warning: {flight.name}: {flight.warning}", file=sys.stderr)
     if not result.agree:
         print(
             f"swath: the flights differ by more than their sigmas allow (chi-square {result.chi_square:.1f} with {result.freedom} degrees "
             "of freedom); was the mount touched between them?",
             file=sys.stderr,
         )
-        return 1
-    return 0
+        return EXIT_CODES[BAD]
+    return EXIT_CODES[DOUBTFUL if warned or torn else GOOD]
 
 
 def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> FlightResult:
@@ -106,6 +130,10 @@ def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> Fli
         leg = max(given.placed, key=lambda leg: leg.sync.samples)
         same = [other for other in given.placed if other.run == leg.run]
         run = adjusted.adjust_run(given, same, leg.run, start, progress, SHARED + COMPASS)
+        if run.is_worse():
+            raise LogError(
+                f"{path}: cannot tell a mount: {run.note()}; expected ground or walls in the lidar's reach for most of the flight"
+            )
         found = flight_result(path, run.windows, nominal, leg.sync.offset_ns * 1e-9, "; ".join(run.warnings()))
     if found is None:
         raise LogError(
@@ -125,6 +153,10 @@ def _header(report: dict[str, Any]) -> str:
     kept = [name for name, found in zip(report["parameters"], report["found"], strict=True) if not found]
     if kept:
         lines.append(f"not observed, left as they were: {', '.join(kept)}")
+    flags = zip(report["parameters"], report["found"], report["significant"], strict=True)
+    small = [name for name, found, significant in flags if found and not significant]
+    if small:
+        lines.append(f"not significant, within 3 sigma of what they were: {', '.join(small)}")
     return "".join(f"# {line}\n" for line in lines)
 
 
@@ -164,15 +196,18 @@ def _text(report: dict[str, Any], folder: Path) -> str:
         report["sigma"],
         report["sigma_with_axes"],
         report["found"],
+        report["significant"],
         strict=True,
     )
-    for name, value, sigma, with_axes, found in rows:
+    for name, value, sigma, with_axes, found, significant in rows:
         note = "" if found else "   not observed: left as it was"
+        if found and not significant:
+            note = "   not significant: within 3 sigma of what it was"
         lines.append(f"{name:14}{value:10.4f}{sigma:10.4f}{with_axes:12.4f}{note}")
     for flight in report["flights"]:
         lines.append(
             f"{flight['log']}: {flight['seconds']:.0f} s, gyro delay {flight['delay_ms']:+.2f} ms, sigma "
-            f"{flight['sigma_delay_ms']:.2f} ms, beyond the synchronisation{'; ' + flight['warning'] if flight['warning'] else ''}"
+            f"{flight['sigma_delay_ms']:.2f} ms, beyond the synchronisation"
         )
     if report["degrees_of_freedom"]:
         lines.append(

@@ -10,12 +10,15 @@ HELP = "learn a compass model (yaw trim over heading) from the trims.csv of seve
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument(
         "trims", nargs="+", type=Path, metavar="TRIMS", help="trims.csv of a run, or the folder of its products"
     )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="the model, such as compass.yaml"
     )
+    add_force(parser)
     parser.add_argument(
         "--harmonics", type=int, choices=(0, 1, 2, 3, 4), default=2, help="periods in a full turn; default: 2"
     )
@@ -23,10 +26,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit and write."""
+    from groundproc.commands.inputs import expect
+    from groundproc.commands.outputs import claim_file
     from groundproc.estimation.calibration.compass import fit_compass, write_compass
     from groundproc.estimation.dynamic.dynamic import settled_run
 
     paths = [path / "trims.csv" if path.is_dir() else path for path in arguments.trims]
+    expect(paths, ("trims", "table"), "the trims.csv of a run of method dynamic")
+    claim_file(arguments.output, (".yaml", ".yml"), arguments.force, paths)
     curve = fit_compass([settled_run(path) for path in paths], arguments.harmonics)
     write_compass(arguments.output, curve)
     print(

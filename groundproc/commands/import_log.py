@@ -13,6 +13,8 @@ HELP = "make a flight log of captures, an autopilot's logs and bags, or of a lin
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument(
         "--pcap", nargs="+", action="extend", default=[], type=Path, metavar="FILE",
         help="captures of the network with the lidar, MAVLink or both (pcap, pcapng), in any order",
@@ -40,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--mount", type=Path, metavar="YAML", help="how the lidar was mounted; goes into the log")
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="LOG.mcap", help="the log to write")
-    parser.add_argument("--force", action="store_true", help="replace the output where it exists")
+    add_force(parser)
     parser.add_argument("--lidar-port", type=int, metavar="N", help="UDP port of the data packets in captures (2368)")
     parser.add_argument(
         "--position-port", type=int, metavar="N", help="UDP port of the position packets in captures (8308)"
@@ -58,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Import and say what was found."""
     from flightlog.errors import UsageError
+    from groundproc.commands.outputs import claim_file
 
     kit = (arguments.scans, arguments.imu, arguments.positions)
     recordings = any((arguments.pcap, arguments.mavlink, arguments.bag))
@@ -67,7 +70,27 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             "import: give recordings with --pcap, --mavlink or --bag, or a kit with all of --scans, --imu and --positions"
         )
+    _expect(arguments)
+    inputs = (*arguments.pcap, *arguments.mavlink, *arguments.bag)
+    claim_file(arguments.output, (".mcap",), arguments.force, inputs)
     return _kit(arguments) if all(kit) else _captures(arguments)
+
+
+def _expect(arguments: argparse.Namespace) -> None:
+    """Refuse what is known to be another kind of file than its option takes."""
+    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
+
+    expect(
+        arguments.pcap,
+        ("capture", "gzip", "archive", "empty", "text", "yaml"),
+        "captures of the network (pcap, pcapng)",
+    )
+    mavlink = ("tlog", "dataflash", "mavlink", "gzip", "empty", "text", "table", "yaml")
+    expect(arguments.mavlink, mavlink, "recordings of the autopilot (.tlog, dataflash .bin)")
+    expect([arguments.scans], ("scans", "table", "archive", "gzip", "text"), "lines of a line scanner (CSV or NPZ)")
+    expect([arguments.imu], ("imu", "table", "gzip", "text"), "samples of an IMU (CSV)")
+    expect([arguments.positions], (*SOLUTIONS, "gzip", "table", "text"), SOLUTION_WORDS)
+    expect_text(arguments.mount, "a mount file (YAML)")
 
 
 def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:

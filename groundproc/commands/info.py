@@ -4,9 +4,12 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
-HELP = "say what flight logs and other recordings hold: rates, losses, clocks, gaps"
+if TYPE_CHECKING:
+    from groundproc.verdict import Verdict
+
+HELP = "say what logs and other recordings hold and how good they are; exit code 0 good, 3 doubtful, 1 bad"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,36 +24,48 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read each log once and print its figures; one that cannot be read does not keep the others from being told."""
+    """Read each log once and print its figures and its verdict; one that cannot be read does not keep the others from being told."""
     from flightlog.errors import SwathError
     from groundproc.flight.summary.text import as_text
 
-    summaries: list[dict[str, Any]] = []
-    code = 0
+    told: list[dict[str, Any]] = []
+    codes: list[int] = []
     for path in arguments.logs:
         try:
-            summaries.append(_summary(path))
+            summary, verdict = _summary(path)
         except SwathError as error:
             if len(arguments.logs) == 1:
                 raise
             print(f"swath: {error}", file=sys.stderr)
-            code = error.exit_code
+            codes.append(error.exit_code)
             continue
-        if not arguments.json:
-            print(("\n" if len(summaries) > 1 else "") + as_text(summaries[-1]))
+        lines = [] if verdict is None else [verdict.line()]
+        told.append(summary if verdict is None else verdict.to_mapping() | summary)
+        codes.append(0 if verdict is None else verdict.exit_code)
+        if arguments.json:
+            print(*lines, sep="\n", end="\n" if lines else "", file=sys.stderr)
+        else:
+            print(("\n" if len(told) > 1 else "") + "\n\n".join([as_text(summary), *lines]))
     if arguments.json:
-        print(json.dumps(summaries[0] if len(arguments.logs) == 1 else summaries, indent=2))
-    return code
+        print(json.dumps(told[0] if len(arguments.logs) == 1 else told, indent=2))
+    return max(codes, key=_WORSE.index)
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    """The figures of a flight log, or of a recording of another program."""
+_WORSE: Final = (0, 3, 1, 2)
+"""Exit codes, the worst last."""
+
+
+def _summary(path: Path) -> "tuple[dict[str, Any], Verdict | None]":
+    """The figures of a flight log with its verdict, or of a recording of another program, which is not judged."""
     from tqdm import tqdm
 
     from flightlog.logfile import LogReader
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.flight.summary.log import summarise
     from groundproc.flight.summary.recording import recording_kind, summarise_recording
+    from groundproc.verdict import judge_log
 
+    expect([path], (*LOG, *_RECORDINGS), LOG_WORDS)
     hidden = not sys.stderr.isatty()
     kind = recording_kind(path)
     size = path.stat().st_size
@@ -60,6 +75,11 @@ def _summary(path: Path) -> dict[str, Any]:
             bar.update(size)
 
         if kind is not None:
-            return summarise_recording(path, kind, advance)
+            return summarise_recording(path, kind, advance), None
         with LogReader(path) as reader:
-            return summarise(reader, advance)
+            summary = summarise(reader, advance)
+    return summary, judge_log(summary)
+
+
+_RECORDINGS: Final = ("capture", "tlog", "dataflash", "bag", "gzip", "folder")
+"""Kinds of `groundproc.flight.kinds` that recordings of other programs are of."""

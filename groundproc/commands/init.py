@@ -9,24 +9,29 @@ HELP = "write a commented survey.yaml with what a log tells: mount, clocks, meth
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a flight log, or all parts of one flight")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: to the terminal")
-    parser.add_argument("--force", action="store_true", help="write over a file that is there")
+    add_force(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the log but for its points, and write."""
-    from flightlog.errors import UsageError
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, told_damage
+    from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
     from groundproc.progress import stages
     from groundproc.steps.facts import facts
     from groundproc.survey import sample
 
     path: Path | None = arguments.output
-    if path is not None and path.exists() and not arguments.force:
-        raise UsageError(f"{path}: is there; --force writes over it")
+    if path is not None:
+        claim_file(path, (".yaml", ".yml"), arguments.force, arguments.logs)
+    expect(arguments.logs, LOG, LOG_WORDS)
     with stages(arguments.logs, {"read": "clocks and autopilot"}) as progress:
         survey, notes, head = facts(arguments.logs, progress)
+    told_damage(arguments.logs)
     text = sample(survey, notes, head)
     if path is None:
         print(text, end="")

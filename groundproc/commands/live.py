@@ -26,16 +26,19 @@ DEFAULT_PORT = 8080
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of what stays")
-    parser.add_argument("--mavlink", default="udp:0.0.0.0:14550", metavar="FROM",
+    add_force(parser)
+    parser.add_argument("--mavlink", metavar="FROM",
                         help="udp:ADDRESS:PORT to listen on, tcp:HOST:PORT to connect to, or a serial device; "
                         "default: udp:0.0.0.0:14550")  # fmt: skip
-    parser.add_argument("--baud", type=int, default=57600, metavar="N", help="of a serial device; default: 57600")
-    parser.add_argument("--address", default="0.0.0.0", help="where to listen for the lidar; default: 0.0.0.0")
-    parser.add_argument("--lidar-port", type=_port, default=2368, metavar="PORT", help="default: 2368")
-    parser.add_argument("--position-port", type=_port, default=8308, metavar="PORT", help="default: 8308")
+    parser.add_argument("--baud", type=int, metavar="N", help="of a serial device; default: 57600")
+    parser.add_argument("--address", help="where to listen for the lidar; default: 0.0.0.0")
+    parser.add_argument("--lidar-port", type=_port, metavar="PORT", help="default: 2368")
+    parser.add_argument("--position-port", type=_port, metavar="PORT", help="default: 8308")
     parser.add_argument("--follow", type=Path, metavar="LOG", help="a flight log that grows, in place of the network")
-    parser.add_argument("--link", default="ins", choices=("ins", "fc"), help="which autopilot's, with --follow")
+    parser.add_argument("--link", choices=("ins", "fc"), help="which autopilot's, with --follow; default: ins")
     parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml; default: the log's, else the project's")
     parser.add_argument("--height", choices=("msl", "relative"), default="msl", help="of the positions; default: msl")
     parser.add_argument("--fov", metavar="A-B", help="azimuths used, clockwise, in degrees, or all; default: 255-105")
@@ -68,6 +71,8 @@ def _metres(text: str) -> float:
 def run(arguments: argparse.Namespace) -> int:
     """Work until SIGINT or SIGTERM, and leave everything whole."""
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
+    from groundproc.commands.outputs import claim_folder
     from groundproc.files import made_folder
     from groundproc.live.inbox import Inbox
     from groundproc.live.products import LiveTrajectory
@@ -80,6 +85,10 @@ def run(arguments: argparse.Namespace) -> int:
         value = getattr(arguments, name)
         if value is not None and not value >= least:
             raise UsageError(f"--{name} {value}: expected {least} or more")
+    _refuse_unused(arguments)
+    expect([arguments.follow], (*LOG, "empty"), LOG_WORDS)  # one that is yet to be written into may be empty
+    expect_text(arguments.mount, "a mount file (YAML)")
+    claim_folder(arguments.output, ("trajectory_live.csv", "cloud_live.laz"), arguments.force)
     over = threading.Event()
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -164,12 +173,35 @@ def _source(arguments: argparse.Namespace, inbox: Inbox) -> Source:
     if arguments.follow is not None:
         from groundproc.live.following import Follower
 
-        return Follower(inbox, arguments.follow, arguments.link)
+        return Follower(inbox, arguments.follow, arguments.link or "ins")
     from groundproc.live.receivers import Receivers
 
     return Receivers(
-        inbox, arguments.address, arguments.lidar_port, arguments.position_port, arguments.mavlink, arguments.baud
+        inbox,
+        arguments.address or "0.0.0.0",
+        arguments.lidar_port or 2368,
+        arguments.position_port or 8308,
+        arguments.mavlink or "udp:0.0.0.0:14550",
+        arguments.baud or 57600,
     )
+
+
+def _refuse_unused(arguments: argparse.Namespace) -> None:
+    """Refuse options that the chosen source would not look at."""
+    from flightlog.errors import UsageError
+
+    if arguments.follow is None:
+        unused, why = ["link"], "it chooses a link of the log of --follow"
+    else:
+        unused, why = (
+            ["mavlink", "baud", "address", "lidar_port", "position_port"],
+            "--follow reads a log, not the network",
+        )
+    for name in unused:
+        if getattr(arguments, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} {getattr(arguments, name)} given, but nothing uses it: {why}")
+    if arguments.baud is not None and (arguments.mavlink is None or arguments.mavlink.startswith(("udp:", "tcp:"))):
+        raise UsageError(f"--baud {arguments.baud} given, but nothing uses it: --mavlink names no serial device")
 
 
 def _page(session: Session, port: int | None) -> PageServer | None:

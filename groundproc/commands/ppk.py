@@ -11,6 +11,8 @@ HELP = "solve raw GNSS observations against a base station (RTKLIB): centimetres
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument(
         "rover", type=Path, metavar="ROVER", help="raw observations aboard: u-blox .ubx, or RINEX 2 or 3 (.gz too)"
     )
@@ -21,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="OUT.pos", help="the solution, as RTKLIB writes them"
     )
+    add_force(parser)
     parser.add_argument(
         "--base-position",
         metavar="LAT,LON,HEIGHT",
@@ -59,6 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.errors import UsageError
+    from groundproc.commands.inputs import expect, expect_text
+    from groundproc.commands.outputs import claim_file
     from groundproc.flight.positions.ppk import Base, base_position, process
 
     if arguments.base_position is not None and arguments.base_average:
@@ -66,6 +71,11 @@ def run(arguments: argparse.Namespace) -> int:
     where = Base(
         None if arguments.base_position is None else base_position(arguments.base_position), arguments.base_average
     )
+    observations = ("observations", "gzip", "navigation")  # what is within, RTKLIB's front end says
+    expect([arguments.rover, arguments.base], observations, "raw observations (u-blox .ubx, RINEX)")
+    expect(arguments.nav, observations, "RINEX navigation files")
+    expect_text(arguments.config, "options as YAML")
+    claim_file(arguments.output, (".pos",), arguments.force, (arguments.rover, arguments.base, *arguments.nav))
     hidden = not sys.stderr.isatty()
     with tqdm(
         total=1.0, leave=False, disable=hidden, bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}", desc="RTKLIB"

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from groundproc.steps.process import State
     from groundproc.steps.request import Request
+    from groundproc.survey import Survey
 
 HELP = "make a georeferenced cloud of a flight: cloud.laz, trajectory.csv, quality.json, pictures"
 
@@ -42,9 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--until", choices=ORDER, metavar="STEP", help=f"stop after this step: {', '.join(ORDER)}")
     parser.add_argument("--status", action="store_true", help="say what is there and what is to be done, and why")
-    parser.add_argument(
-        "--force", action="store_true", help="do every step again, and write over files that are not ours"
-    )
+    parser.add_argument("--force", action="store_true", help="do every step again, and write over files that are there")
     parser.add_argument("--json", action="store_true", help="print what quality.json holds")
 
 
@@ -69,16 +68,24 @@ def run(arguments: argparse.Namespace) -> int:
         _print_states(found, folder, arguments.json)
         return 0
     quality = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
-    print(json.dumps(quality, indent=2) if arguments.json else _report(quality, folder))
-    of_positions = [
-        leg["positions"]["note"] for leg in quality["legs"] if leg["positions"] and leg["positions"]["note"]
-    ]
+    return _tell(quality, folder, arguments.json)
+
+
+def _tell(quality: dict[str, Any], folder: Path, as_json: bool) -> int:
+    """Print what came of it: figures, every warning, and the verdict as the last line; give its exit code."""
+    from groundproc.verdict import Verdict, warnings_in
+
+    verdict = Verdict.from_mapping(quality)
+    print(json.dumps(quality, indent=2) if as_json else _report(quality, folder), flush=True)
+    of_positions = [leg["positions"]["note"] for leg in quality["legs"] if leg["positions"]]
     for note in dict.fromkeys(quality["autopilot"]["notes"] + of_positions):
-        print(f"swath: {note}", file=sys.stderr)
-    if quality["trajectory"]["warning"]:
-        print(f"swath: {quality['trajectory']['warning']}", file=sys.stderr)
-        return 1
-    return 0
+        if note:
+            print(f"swath: note: {note}", file=sys.stderr, flush=True)
+    for warning in warnings_in(quality):
+        print(f"swath: warning: {warning}", file=sys.stderr, flush=True)
+    # with --json the verdict is the object's first key, and the object stays the only thing on standard output
+    print(verdict.line(), file=sys.stderr if as_json else sys.stdout)
+    return verdict.exit_code
 
 
 def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
@@ -86,18 +93,52 @@ def _request(arguments: argparse.Namespace) -> tuple[Request, Path]:
     from flightlog.errors import UsageError
     from groundproc.steps.process import remembered
     from groundproc.steps.request import Request
-    from groundproc.survey import Survey
+    from groundproc.survey import Survey, TrajectorySettings
 
     first: Path = arguments.logs[0]
+    _expect(arguments)
     if arguments.output is not None:
         return Request(arguments.logs, _survey(arguments, Survey()), arguments.trajectory), arguments.output
     if len(arguments.logs) > 1 or not first.is_dir():
-        raise UsageError("-o DIR is missing: the folder of the products")
+        raise UsageError("-o DIR is missing: the folder of the products; expected swath process LOG... -o DIR")
     before = remembered(first)
     if before is None:
         raise UsageError(f"{first}: no products of `swath process` in this folder; expected LOG... -o DIR")
-    again = replace(before, survey=_survey(arguments, before.survey), poses=arguments.trajectory or before.poses)
-    return again, first
+    chosen = before.survey
+    if (
+        arguments.trajectory is not None
+    ):  # what a trajectory was estimated with before is of no use for one from elsewhere
+        plain = {name: value for name, value in vars(TrajectorySettings()).items() if name != "lasers"}
+        chosen = replace(chosen, **plain)
+    return replace(before, survey=_survey(arguments, chosen), poses=arguments.trajectory or before.poses), first
+
+
+def _expect(arguments: argparse.Namespace) -> None:
+    """Refuse what is known to be another kind of file than it should be."""
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
+
+    goes_on = arguments.output is None and len(arguments.logs) == 1
+    expect(arguments.logs, (*LOG, "products", "folder") if goes_on else LOG, LOG_WORDS)
+    expect_text(arguments.config, "a survey file (YAML)")
+    expect([arguments.trajectory], ("poses", "products", "folder"), "a folder of products or a trajectory.csv")
+
+
+def _expect_named(survey: Survey) -> None:
+    """The same for the files that a survey names."""
+    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
+    from groundproc.sensors.lasers import ESTIMATE
+
+    lasers = None if survey.lasers == ESTIMATE else survey.lasers
+    mount = survey.mount if isinstance(survey.mount, str) else None
+    expect_text(mount, "a mount file (YAML)")
+    expect_text(survey.compass, "a file of `swath calibrate` or `swath compass` (YAML)")
+    expect_text(lasers, "a file of `swath calibrate --lasers` (YAML)")
+    for name, kinds, expected in (
+        (survey.positions, (*SOLUTIONS, "table", "text"), SOLUTION_WORDS),
+        (survey.control, ("control", "table", "text"), "a table of control points (CSV: x, y, z, sigma)"),
+    ):
+        if name is not None and Path(name).exists():  # one that is not there, its reader names
+            expect([name], kinds, expected)
 
 
 def _survey(arguments: argparse.Namespace, otherwise: Any) -> Any:
@@ -110,7 +151,9 @@ def _survey(arguments: argparse.Namespace, otherwise: Any) -> Any:
     tree = config.to_mapping(config.load(arguments.config, Survey) if arguments.config else otherwise)
     if arguments.config:
         beside(tree, arguments.config.parent, FILES, (ESTIMATE,))
-    return config.from_mapping(tree | given_settings(arguments, SECTIONS), Survey, "command line")
+    survey = config.from_mapping(tree | given_settings(arguments, SECTIONS), Survey, "command line")
+    _expect_named(survey)
+    return survey
 
 
 def _status(request: Request, folder: Path, as_json: bool) -> int:

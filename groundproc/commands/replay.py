@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mavlink", metavar="udp:ADDRESS:PORT", help="send the autopilot's bytes there; default: they are not sent"
     )
-    parser.add_argument("--link", default="ins", metavar="NAME", help="which autopilot's, ins or fc; default: ins")
+    parser.add_argument("--link", metavar="NAME", help="which autopilot's, ins or fc; default: ins")
     parser.add_argument("--speed", default="1", metavar="X", help="times real time, or max; default: 1")
     parser.add_argument("--loop", action="store_true", help="again and again, until interrupted")
 
@@ -33,16 +33,21 @@ def run(arguments: argparse.Namespace) -> int:
     """Play, with a progress bar on a terminal."""
     from tqdm import tqdm
 
+    from flightlog.errors import UsageError
+    from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.field.replay import Destination, Replayed, parse_mavlink, parse_speed, replay
 
+    if arguments.link is not None and arguments.mavlink is None:
+        raise UsageError(f"--link {arguments.link} given, but nothing uses it without --mavlink")
     to = Destination(
         arguments.host,
         arguments.lidar_port,
         arguments.position_port,
         None if arguments.mavlink is None else parse_mavlink(arguments.mavlink),
-        arguments.link,
+        arguments.link or "ins",
     )
     speed = parse_speed(arguments.speed)
+    expect(arguments.logs, LOG, LOG_WORDS)
 
     def once() -> Replayed:
         with tqdm(unit="s", leave=False, disable=not sys.stderr.isatty()) as bar:

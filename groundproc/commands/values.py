@@ -5,7 +5,7 @@ import math
 from flightlog.errors import UsageError
 
 
-def field_of_view(text: str, word: str = "--fov") -> tuple[float, float]:
+def field_of_view(text: str, word: str = "--fov-deg") -> tuple[float, float]:
     """Azimuths such as "255-105" or "-105:105", clockwise from first to second, or "all"; degrees."""
     if text == "all":
         return 0.0, 360.0
@@ -19,7 +19,7 @@ def field_of_view(text: str, word: str = "--fov") -> tuple[float, float]:
     return start, end
 
 
-def milliseconds(text: str, word: str = "--pose-grid") -> float:
+def milliseconds(text: str, word: str = "--pose-grid-ms") -> float:
     """A duration such as "10ms", or a plain number of milliseconds."""
     try:
         value = float(text.removesuffix("ms"))

@@ -212,11 +212,26 @@ def legs(runs: Sequence[LidarRun], boots: Sequence[Boot], mat_ins_lidar: Array, 
             last_lidar_ns = run.line.device_ns(run.last_receive_ns)
             found.append(Leg(boot, number, match, tie, line, run.first_receive_ns, run.last_receive_ns, last_lidar_ns))
     if not found:
-        raise ClockError(
-            "lidar and autopilot: their recordings do not overlap by 2 s in receive time; is it the same flight, and were the clocks "
-            "of both computers right?"
-        )
+        raise ClockError(_apart(runs, boots))
     return found
+
+
+def _apart(runs: Sequence[LidarRun], boots: Sequence[Boot]) -> str:
+    """Why no leg was found: the recordings are short, or of different times."""
+    lidar = min(run.first_receive_ns for run in runs), max(run.last_receive_ns for run in runs)
+    heard = [host_ns for _, host_ns in (boot.host_pairs() for boot in boots) if len(host_ns)]
+    expected = f"expected {LEAST_OVERLAP_NS / NS_PER_S:g} s or more to tie their clocks by"
+    if not heard:
+        return f"lidar and autopilot: no message of the autopilot tells the time since its boot, {expected}"
+    autopilot = min(int(host_ns.min()) for host_ns in heard), max(int(host_ns.max()) for host_ns in heard)
+    common_s = (min(lidar[1], autopilot[1]) - max(lidar[0], autopilot[0])) / NS_PER_S
+    if common_s > 0.0:
+        return f"lidar and autopilot: the log holds {common_s:.1f} s of both together, {expected}"
+    lidar_text, autopilot_text = (" to ".join(map(utc_text, span)) for span in (lidar, autopilot))
+    return (
+        f"lidar and autopilot: were not recorded at the same time (lidar {lidar_text}, autopilot {autopilot_text}), {expected}; "
+        "are they of one flight, and were the clocks of both computers right?"
+    )
 
 
 def _utc(run: LidarRun, boot: Boot, boot_line: HostLine, match: Sync) -> tuple[UtcTie, tuple[Line, ...]]:

@@ -1,5 +1,7 @@
 """What stays of a live session: the trajectory as it went, and the thinned cloud."""
 
+import contextlib
+import os
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -51,7 +53,26 @@ class LiveTrajectory:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        lost = isinstance(error, SourceError)
+        try:
+            self._file.close()
+        except OSError as failed:
+            lost = True
+            if error is None:
+                raise SourceError(f"{self._path}: cannot be written ({failed.strerror})") from None
+        finally:
+            if lost:
+                self._leave_whole()
+
+    def _leave_whole(self) -> None:
+        """Take off a row that a full disk cut, and the file where no row is left."""
+        with contextlib.suppress(OSError):
+            content = self._path.read_bytes()
+            whole = content.rfind(b"\n") + 1
+            if whole < len(content):
+                os.truncate(self._path, whole)
+            if content.count(b"\n", 0, whole) < 2:
+                self._path.unlink()
 
     def write(self, place: Place, frame: LocalFrame, lag_s: float) -> None:
         """Append a row; one that is not later than the last is left out, for the lidar's clock was set."""

@@ -14,8 +14,9 @@ from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
-from groundproc.files import make_folder, written_aside
+from groundproc.files import written_aside
 from groundproc.flight import load, timebase
+from groundproc.flight.belonging import in_order_of_one_flight
 from groundproc.flight.lidar import lidar_of
 from groundproc.sensors.shots import Gate, Shots
 
@@ -40,9 +41,8 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
     LogError
         No lidar packets, or none that gives a point.
     """
-    make_folder(output.parent)
     with contextlib.ExitStack() as stack:
-        readers = [stack.enter_context(LogReader(path)) for path in logs]
+        readers = in_order_of_one_flight([stack.enter_context(LogReader(path)) for path in logs])
         fixes = [
             (s.device_time_ns, fix) for s in load.position_samples(readers).sentences if (fix := nmea.parse_rmc(s.text))
         ]

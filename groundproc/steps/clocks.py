@@ -12,6 +12,8 @@ from flightlog.constants import HOUR_NS
 from flightlog.logfile import LogReader
 from flightlog.mount import load_mount
 from groundproc.estimation import ins
+from groundproc.flight.autopilot import Boot
+from groundproc.flight.summary.telemetry import FIX_3D
 from groundproc.flight.timeline import Leg
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
@@ -95,6 +97,7 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
         "positions": describe_positions(leg),
         "from_board_log": leg.boot.origins,
         "sync": describe_sync(leg),
+        "gps_after_first_fix": describe_fixes(leg.boot),
     }
 
 
@@ -104,6 +107,15 @@ def describe_positions(leg: Leg) -> dict[str, Any] | None:
         return None
     fixes = ins.position_fixes(leg.boot, "msl")
     return {"used": len(fixes.time_ns), "left_out": fixes.left_out, "note": fixes.note}
+
+
+def describe_fixes(boot: Boot) -> dict[str, int] | None:
+    """Reports of the receiver since its first fix, and those of them without one; None where there is no fix, or none is reported."""
+    if not boot.has("GPS_RAW_INT"):
+        return None
+    fixed = boot.tables["GPS_RAW_INT"]["fix_type"] >= FIX_3D
+    since = fixed[int(np.argmax(fixed)) :]
+    return {"reports": len(since), "without": int((~since).sum())} if fixed.any() else None
 
 
 def describe_sync(leg: Leg) -> dict[str, Any]:

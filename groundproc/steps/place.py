@@ -8,7 +8,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from flightlog.errors import CoverageError, LogError
+import numpy.typing as npt
+
+from flightlog.errors import CoverageError, LogError, UsageError
 from groundproc import geodesy
 from groundproc.cloud import placing
 from groundproc.flight.lidar import lidar_of
@@ -32,7 +34,11 @@ FOUND: Final = f"{INSIDE}/place.json"
 def settings(request: Request) -> Mapping[str, Any]:
     """The window of shots, the CRS, and what heights refer to."""
     survey = request.survey
-    return section(survey, PlacingSettings) | {"crs": survey.crs, "height": survey.height}
+    return section(survey, PlacingSettings) | {
+        "crs": survey.crs,
+        "crs_anyway": survey.crs_anyway,
+        "height": survey.height,
+    }
 
 
 def parts(request: Request) -> Mapping[str, Any]:
@@ -41,10 +47,18 @@ def parts(request: Request) -> Mapping[str, Any]:
 
 
 def check(request: Request) -> None:
-    """Refuse a wrong code and a product that there is not before the work, not after."""
-    chosen(request.survey.products)
-    if request.survey.crs is not None:
-        geodesy.projected_crs(request.survey.crs)
+    """Refuse what cannot be, or would not be used, before the work, not after."""
+    survey = request.survey
+    chosen(survey.products)
+    if survey.crs is not None:
+        geodesy.projected_crs(survey.crs)
+    elif survey.crs_anyway:
+        raise UsageError("crs_anyway given, but no crs; without one the UTM zone of the flight is taken")
+    if survey.geoid is not None and survey.height != "ellipsoid" and survey.positions is None:
+        raise UsageError(
+            f"geoid: {survey.geoid} given, but nothing uses it: heights are {survey.height}, and there are no outside "
+            "positions; expected with height ellipsoid or with positions"
+        )
 
 
 def projection_of(frame: LocalFrame, survey: Survey) -> geodesy.Projection:
@@ -53,10 +67,18 @@ def projection_of(frame: LocalFrame, survey: Survey) -> geodesy.Projection:
     return geodesy.Projection(frame, geodesy.projected_crs(code))
 
 
+def check_place(survey: Survey, latitude_deg: npt.ArrayLike, longitude_deg: npt.ArrayLike) -> None:
+    """Refuse a CRS that is not made for where the flight was, unless the user wants it anyway."""
+    if survey.crs is not None and not survey.crs_anyway:
+        geodesy.check_area(geodesy.projected_crs(survey.crs), latitude_deg, longitude_deg)
+
+
 def work(run: Run, folders: Folders) -> None:
     """Place the points and finish the products that are made of them."""
     made = run.estimate
     timeline = tied(run.timeline, made.ties) if made.ties else run.timeline
+    latitude, longitude, _ = made.trajectory.frame.to_geodetic(made.trajectory.position_m)
+    check_place(run.survey, latitude, longitude)
     projection = projection_of(made.trajectory.frame, run.survey)
     survey, tally = run.survey, Tally()
     context = Context(run.folder, run.folder, survey, made, projection, inputs=run.names)

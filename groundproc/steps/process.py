@@ -5,7 +5,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -13,7 +13,7 @@ from typing import Any
 
 from flightlog import config
 from flightlog.clock import utc_text
-from flightlog.errors import UsageError
+from flightlog.errors import ClockError, CoverageError, LogError, SourceError, SwathError, UsageError
 from groundproc.estimation.method import Progress
 from groundproc.files import made_folder
 from groundproc.steps import ORDER
@@ -103,9 +103,13 @@ def process(
             with Run(request, folder, progress) as run:
                 for step in steps()[: ORDER.index(until) + 1]:
                     _bring_up_to_date(step, run, ledger, force)
-        except Exception:  # raised again: whatever went wrong, a folder that held nothing is left so
+        except Exception as error:  # raised again: whatever went wrong, a folder that held nothing is left so
             if was_empty:
                 ledger.forget_all()
+            if isinstance(error, LogError | ClockError | CoverageError) and run.torn():
+                raise type(error)(f"{error} ({run.torn()})") from error
+            if isinstance(error, OSError):
+                raise SourceError(f"{error.filename or folder}: {error.strerror or error}") from error
             raise
         finally:
             if not ledger.entries:
@@ -141,8 +145,17 @@ def _execute(step: Step, parts: Sequence[str], run: Run, ledger: Ledger, force: 
         with undisturbed():
             for part, place in folders.items():
                 ledger.commit(step.unit(part), Entry(keys[part], outputs[part], finished, seconds), place)
+    except SwathError as error:
+        raise type(error)(_in_place(str(error), folders, ledger.folder)) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
+
+
+def _in_place(sentence: str, folders: Mapping[str, Path], target: Path) -> str:
+    """A sentence about a file being made, with the name that the user knows it by."""
+    for place in folders.values():
+        sentence = sentence.replace(str(place), str(target))
+    return sentence
 
 
 def _fingerprints(folder: Path) -> dict[str, Fingerprint]:
@@ -156,7 +169,9 @@ def _refuse_foreign(ledger: Ledger, outputs: Sequence[str]) -> None:
     owned = ledger.owned()
     for name in outputs:
         if name not in owned and (ledger.folder / name).exists():
-            raise UsageError(f"{ledger.folder / name}: is there and was not made by this; --force replaces it")
+            raise UsageError(
+                f"{ledger.folder / name}: exists already and was not made by this; give another folder, or --force to write over it"
+            )
 
 
 # What is to be done ---------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Step quality: quality.json, put together from what the finished steps left."""
+"""Step quality: quality.json, put together from what the finished steps left, with a verdict on all of it."""
 
 import json
 from collections.abc import Mapping
@@ -15,6 +15,8 @@ from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import SECTIONS, Survey, section
 from groundproc.trajectory.estimate import Estimate
+from groundproc.trajectory.trajectory import Trajectory
+from groundproc.verdict import judge_flight
 
 
 def settings(request: Request) -> Mapping[str, Any]:
@@ -27,6 +29,8 @@ def work(run: Run, folders: Folders) -> None:
     tied = json.loads((run.folder / clocks.FOUND).read_text(encoding="utf-8"))
     placed = json.loads((run.folder / place.FOUND).read_text(encoding="utf-8"))
     quality = describe(run.survey, run.estimate, tied, placed)
+    # first, where a reader of the file looks
+    quality = judge_flight(quality).to_mapping() | quality
     (folders[WHOLE] / "quality.json").write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
 
 
@@ -58,6 +62,8 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
             "covered_s": float(seconds[trajectory.covered[:-1]].sum()),
             "gaps_s": float(seconds[~trajectory.covered[:-1]].sum()),
             "median_sigma_m": np.median(trajectory.sigma_position_m, axis=0).tolist(),
+            "largest_sigma_m": np.max(trajectory.sigma_position_m, axis=0).tolist(),
+            "turn_rate_deg_s": turn_rate_deg_s(trajectory),
             "sigma_source": made.sigma_source,
             "note": made.note,
             "warning": made.warning,
@@ -66,6 +72,11 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
         "lidar": placed["lidar"],
         "points": placed["points"],
     }
+
+
+def turn_rate_deg_s(trajectory: Trajectory) -> float:
+    """What 19 of 20 knots turn slower than [deg/s]."""
+    return float(np.rad2deg(np.percentile(np.linalg.norm(trajectory.rate_rad_s, axis=1), 95.0)))
 
 
 def describe_mount(made: Estimate) -> dict[str, Any]:

@@ -2,17 +2,17 @@
 
 import contextlib
 import functools
-import itertools
+import shlex
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.estimation.method import Progress
+from groundproc.flight.belonging import in_order_of_one_flight
 from groundproc.flight.flight import Flight, read_flight
 from groundproc.flight.mounting import find_mount
 from groundproc.flight.timeline import Leg, legs
@@ -58,10 +58,16 @@ class Run:
 
     @cached_property
     def readers(self) -> Sequence[LogReader]:
-        """The logs, in order of time."""
+        """The logs, in order of time; those of several flights are refused."""
         readers = [self._stack.enter_context(LogReader(path)) for path in self.request.logs]
-        check_order(readers)
-        return readers
+        return in_order_of_one_flight(readers, self.survey.mount)
+
+    def torn(self) -> str:
+        """Which logs are cut off, in words: where a step fails, that may be why."""
+        torn = [reader.path for reader in self.__dict__.get("readers", ()) if reader.damage.truncated]
+        return "; ".join(
+            f"{path} is cut off: `swath recover {shlex.quote(str(path))}` saves what is left" for path in torn
+        )
 
     @cached_property
     def mount_and_source(self) -> tuple[Mount, str]:
@@ -83,13 +89,3 @@ class Run:
     def estimate(self) -> Estimate:
         """What step trajectory left, read from its files: a run that goes on places the points with the same as one that never stopped."""
         return read_estimate(self.folder)
-
-
-def check_order(readers: list[LogReader]) -> None:
-    """Sort logs by time; logs that overlap are not of one flight."""
-    readers.sort(key=lambda reader: reader.start_ns)
-    for before, after in itertools.pairwise(readers):
-        if after.start_ns < before.end_ns - 1_000_000_000:
-            raise UsageError(
-                f"{before.path} and {after.path}: overlap in time; the parts of one flight follow each other"
-            )

@@ -11,6 +11,7 @@ from flightlog.mount import Mount
 from groundproc.estimation import methods
 from groundproc.estimation.method import chosen_corrections, gather
 from groundproc.sensors.lasers import ESTIMATE
+from groundproc.steps.place import check_place
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
@@ -57,8 +58,15 @@ def check(request: Request) -> None:
     chosen_corrections(request.survey)
     if request.poses is None:
         methods.check(request.survey)
-    elif request.survey.lasers == ESTIMATE:
+        return
+    if request.survey.lasers == ESTIMATE:
         raise UsageError("lasers: estimate given, but with a trajectory from elsewhere nothing is estimated")
+    plain = section(Survey(), TrajectorySettings)
+    for name, value in section(request.survey, TrajectorySettings).items():
+        if name != "lasers" and value != plain[name]:
+            raise UsageError(
+                f"{name}: {value} given, but nothing uses it: with a trajectory from elsewhere nothing is estimated"
+            )
 
 
 def work(run: Run, folders: Folders) -> None:
@@ -72,7 +80,11 @@ def estimate(run: Run) -> Estimate:
     poses, survey = run.request.poses, run.survey
     if poses is not None:
         return from_elsewhere(poses, survey, mount, source)
-    return methods.estimate(gather(run.readers, run.flight, run.timeline, mount, survey, source), run.progress)
+    given = gather(run.readers, run.flight, run.timeline, mount, survey, source)
+    # now, and not after minutes of work
+    for fixes in given.fixes:
+        check_place(survey, fixes.latitude_deg, fixes.longitude_deg)
+    return methods.estimate(given, run.progress)
 
 
 def from_elsewhere(place: Path, survey: Survey, mount: Mount, mount_source: str) -> Estimate:

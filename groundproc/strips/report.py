@@ -22,6 +22,8 @@ from groundproc.trajectory.table import write_trajectory
 Array = npt.NDArray[np.float64]
 
 JSON: Final = "adjustment.json"
+FILES: Final = ("trajectory.csv", "differences.png", "corrections.png", JSON)
+"""All that is written beside the clouds."""
 _SHOWN: Final = 20_000
 _DOT: Final = 3
 

@@ -14,6 +14,7 @@ from flightlog.clock import utc_text
 from flightlog.errors import CoverageError, SwathError, UsageError
 from groundproc.cloud.gpstime import Clock
 from groundproc.files import made_folder
+from groundproc.geodesy import check_area
 from groundproc.strips import report
 from groundproc.strips.adjust import COARSEST_M, MOST_INTERVALS, Adjusted, Sigmas, adjust
 from groundproc.strips.clouds import agreed_crs, chunks, look, rewriters
@@ -59,6 +60,8 @@ class Task:
         Taken off the trajectory's heights.
     control : Path or None
     options : StripOptions
+    crs_anyway : bool
+        Take a CRS that is not made for where the trajectory is.
     """
 
     clouds: Sequence[Path]
@@ -69,6 +72,7 @@ class Task:
     undulation_m: float = 0.0
     control: Path | None = None
     options: StripOptions = field(default_factory=StripOptions)
+    crs_anyway: bool = False
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:
@@ -141,6 +145,8 @@ def _site(task: Task) -> Site:
             raise UsageError(f"{error}; say it with --week") from None
     else:
         route = read_route(task.trajectory, crs, near_utc_ns=near, week=task.week, undulation_m=task.undulation_m)
+    if not task.crs_anyway:
+        check_area(crs, route.latitude_deg, route.longitude_deg)
     times = route.poses.time_ns
     return Site(clouds, Clock(task.week, int(times[len(times) // 2])), route, task.options)
 

@@ -97,7 +97,7 @@ class TrajectorySettings:
     pose_grid_ms: float | None = setting(
         None,
         "method ins: one pose for so many milliseconds, as the source did with 10",
-        words=("--pose-grid",),
+        words=("--pose-grid-ms",),
         metavar="MS",
         reads="milliseconds",
         absent="a pose for every firing",
@@ -116,17 +116,17 @@ class PlacingSettings:
     fov_deg: tuple[float, float] = setting(
         (255.0, 105.0),
         "azimuths kept, clockwise from first to second, in degrees; 0 and 360 keep all",
-        words=("--fov",),
+        words=("--fov-deg",),
         metavar="A-B",
         reads="azimuths",
         minimum=-360,
         maximum=360,
     )
     min_range_m: float = setting(
-        1.0, "nearer returns are dropped [m]", words=("--min-range",), metavar="M", minimum=0, maximum=131
+        1.0, "nearer returns are dropped [m]", words=("--min-range-m",), metavar="M", minimum=0, maximum=131
     )
     max_range_m: float = setting(
-        100.0, "farther returns are dropped [m]", words=("--max-range",), metavar="M", minimum=0, maximum=131.07
+        100.0, "farther returns are dropped [m]", words=("--max-range-m",), metavar="M", minimum=0, maximum=131.07
     )
 
     def __post_init__(self) -> None:
@@ -144,6 +144,9 @@ class OutputSettings:
         words=("--crs", "--epsg"),
         metavar="EPSG",
         absent="UTM zone of the first fix",
+    )
+    crs_anyway: bool = setting(
+        False, "take the CRS where it is not made for the place of the flight", words=("--crs-anyway",)
     )
     height: str = setting("msl", "what heights refer to", words=("--height",), choices=HEIGHTS)
     geoid: float | str | None = setting(

@@ -15,6 +15,7 @@ from groundproc.geodesy import (
     LARGEST_RESIDUAL_M,
     LocalFrame,
     Projection,
+    check_area,
     projected_crs,
     undulation,
     utm_epsg,
@@ -117,6 +118,50 @@ def test_a_crs_that_cannot_be_used_is_refused_by_name(epsg: int, why: str) -> No
     """Unknown, geographic, three-dimensional, earth-centred, in feet, compound, vertical."""
     with pytest.raises(GeodesyError, match=rf"EPSG:{epsg}.*{why}"):
         projected_crs(epsg)
+
+
+@pytest.mark.parametrize(
+    ("epsg", "latitude", "longitude"),
+    [
+        (32633, 58.39, 15.57),  # Sweden
+        (32633, 58.39, 12.0),  # on its edge
+        (3006, 63.8, 20.3),  # one zone for a country
+        (32660, 44.0, 179.99),  # the last before the 180th meridian
+        (3832, -17.7, 178.0),  # an area that lies across it, on both sides
+        (3832, -17.7, -178.0),
+        (2193, -36.8, 174.7),
+    ],
+)
+def test_a_crs_holds_the_places_that_it_is_made_for(epsg: int, latitude: float, longitude: float) -> None:
+    check_area(projected_crs(epsg), latitude, longitude)
+
+
+@pytest.mark.parametrize(
+    ("epsg", "latitude", "longitude", "zone"),
+    [
+        (32610, 58.39, 15.57, "EPSG:32633"),
+        (32733, 58.39, 15.57, "EPSG:32633"),
+        (32633, 58.39, 11.9, "EPSG:32632"),
+        (3006, -33.9, 18.4, "EPSG:32734"),
+        (32660, 44.0, -179.98, "EPSG:32601"),
+        (2193, 36.8, 174.7, "EPSG:32660"),
+    ],
+)
+def test_elsewhere_a_crs_is_refused_with_the_zone_that_would_do(
+    epsg: int, latitude: float, longitude: float, zone: str
+) -> None:
+    with pytest.raises(GeodesyError, match=f"EPSG:{epsg}.*{zone}.*--crs-anyway"):
+        check_area(projected_crs(epsg), latitude, longitude)
+
+
+def test_one_place_of_the_flight_outside_is_enough() -> None:
+    with pytest.raises(GeodesyError, match=r"11\.9 E, which EPSG:32632"):
+        check_area(projected_crs(32633), np.array([58.0, 58.0]), np.array([12.1, 11.9]))
+
+
+def test_near_the_poles_no_zone_is_named() -> None:
+    with pytest.raises(GeodesyError, match="86 N, 15 E; --crs-anyway"):
+        check_area(projected_crs(32633), 86.0, 15.0)
 
 
 @pytest.mark.parametrize("epsg", [32633, 3006, 3009, 25833, 3067, 2154])

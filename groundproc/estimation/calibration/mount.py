@@ -35,6 +35,8 @@ FEWEST: Final = 10
 """Slices, a second, that a heading must have been flown for to count as seen."""
 KNOWN: Final = 0.5
 """A parameter counts as found where its sigma is below this share of what was known before."""
+SIGNIFICANT: Final = 3.0
+"""A parameter within so many sigmas, those of the axes included, of what it was is not said to have changed."""
 DOUBTFUL: Final = 0.001
 """Flights that differ so much that chance makes it rarer than this do not agree."""
 
@@ -161,6 +163,7 @@ class MountCalibration:
             "sigma_with_axes": (with_axes * scale).tolist(),
             "correlation": (self.covariance / np.outer(sigma, sigma)).round(4).tolist(),
             "found": self.found.tolist(),
+            "significant": (self.found & (np.abs(self.value) > SIGNIFICANT * with_axes)).tolist(),
             "chi_square": self.chi_square,
             "degrees_of_freedom": self.freedom,
             "agree": self.agree,

@@ -115,6 +115,7 @@ def import_flight(
     senders = Senders(address_of(sender) if sender else b"")
     partial = output.with_name(f".{output.name}.partial")
     try:
+        output.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".swath-import-", dir=output.parent) as unpacked:
             while True:
                 result = _attempt(recordings, partial, Path(unpacked), ports, attachments, senders, progress)

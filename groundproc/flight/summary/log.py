@@ -141,6 +141,7 @@ class LogSummary:
                 for link, (parser, telemetry) in sorted(self.links.items())
             },
             "utc": self._utc(),
+            "lidar_with_autopilot_s": self._together_s(),
             "gaps": self.gaps,
             "gap_count": self.gap_count,
             "messages_backwards": self.backwards,
@@ -170,6 +171,14 @@ class LogSummary:
             "mended": list(held.mended),
             "doubts": list(held.doubts),
         }
+
+    def _together_s(self) -> float | None:
+        """Seconds in which both lidar and autopilot were recorded; None where one of them was not at all."""
+        lidar, link = self.topics.get(self.model.topic), self.topics.get(f"{records.MAVLINK.topic}ins")
+        if lidar is None or link is None:
+            return None
+        both_ns = min(lidar.last_ns, link.last_ns) - max(lidar.first_ns, link.first_ns)
+        return round(max(both_ns, 0) / NS_PER_S, 3)
 
     def _seen(self, *topics: str) -> bool:
         return any(topic in self.topics for topic in topics)

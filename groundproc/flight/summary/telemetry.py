@@ -14,6 +14,8 @@ from groundproc.flight.summary.rates import rate_hz, rounded
 _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
 """A boot time this much below the last one is a new boot; messages that overtake each other differ by less."""
+FIX_3D: Final = 3
+"""`fix_type` of GPS_RAW_INT from which on there is a position with its height."""
 _SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
 _GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
 _BOOT_TIMED: Final = tuple(message_id(name) for name in ("SYSTEM_TIME", "ATTITUDE", "GLOBAL_POSITION_INT"))
@@ -62,6 +64,10 @@ class TelemetrySummary:
     """SYSTEM_TIME messages with a date that cannot be; one without a fix has none."""
     fix_type: int | None = None
     satellites: int | None = None
+    fixes: int = 0
+    """Reports of the receiver since its first fix in three dimensions."""
+    without_fix: int = 0
+    """Those of them without one."""
 
     def add(self, frame: Frame) -> None:
         """Take the next frame; one outside the dialect counts nothing, its sender is not proven."""
@@ -75,7 +81,11 @@ class TelemetrySummary:
         node.numbers.take(frame)
         self.vehicles.hear(frame)
         if frame.message_id == _GPS_RAW_INT:
-            self.fix_type = max(self.fix_type or 0, _value(frame, "fix_type"))
+            fix_type = _value(frame, "fix_type")
+            self.fix_type = max(self.fix_type or 0, fix_type)
+            if self.fix_type >= FIX_3D:
+                self.fixes += 1
+                self.without_fix += fix_type < FIX_3D
             self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
         if frame.message_id in _BOOT_TIMED:
             _boot(node, frame.time_ns, _value(frame, "time_boot_ms"))
@@ -103,6 +113,7 @@ class TelemetrySummary:
             "reboots": sum(max(len(node.boots) - 1, 0) for node in autopilots.values()),
             "gps_fix_type": self.fix_type,
             "gps_satellites": self.satellites,
+            "gps_after_first_fix": {"reports": self.fixes, "without": self.without_fix} if self.fixes else None,
             "first_system_time_utc": clock.utc_text(self.first_utc_ns) if self.first_utc_ns else None,
             "impossible_system_times": self.impossible_utc,
             "messages": [

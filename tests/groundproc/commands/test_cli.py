@@ -90,3 +90,34 @@ def test_a_library_that_is_not_installed_is_one_sentence_and_a_mistake_of_ours_i
     without("groundproc.nothing")
     with pytest.raises(ModuleNotFoundError):
         cli.main(["info"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["proces", "a.mcap"], "did you mean process?"),
+        (["process", "--metod", "ins", "a.mcap"], "did you mean --method?"),
+        (["process", "a.mcap", "-o", "out", "--height", "mls"], "did you mean msl?"),
+        (["process"], "the following arguments are required: LOG"),
+        (["decode", "a.mcap"], "the following arguments are required: -o/--output"),
+        (["-x"], "unrecognized arguments: -x"),
+    ],
+)
+def test_a_slip_of_the_finger_is_one_sentence_with_what_was_meant(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(words)
+    assert caught.value.code == 2
+    text = capsys.readouterr().err
+    assert said in text
+    assert "--help` lists all" in text
+    assert text.count("\n") == 1
+
+
+def test_help_may_be_asked_for_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, said in ((["help"], "commands (swath COMMAND"), (["help", "decode"], "usage: swath decode")):
+        with pytest.raises(SystemExit) as caught:
+            main(words)
+        assert caught.value.code == 0
+        assert said in capsys.readouterr().out

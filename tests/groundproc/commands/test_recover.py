@@ -52,4 +52,4 @@ def test_a_log_without_its_index_only_loses_nothing_and_the_exit_code_is_0(log: 
 def test_what_is_no_log_ends_with_1_and_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "x.mcap").write_bytes(b"")
     assert main(["recover", str(tmp_path / "x.mcap")]) == 1
-    assert "is no MCAP file" in capsys.readouterr().err
+    assert "is empty; expected a flight log" in capsys.readouterr().err

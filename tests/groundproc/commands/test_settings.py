@@ -17,10 +17,10 @@ TYPED = {
     "mount": (["--mount", "m.yaml"], "m.yaml"), "sync": (["--sync", "host"], "host"),
     "method": (["--method", "ins"], "ins"), "causal": (["--causal"], True), "positions": (["--positions", "a.pos"], "a.pos"),
     "control": (["--control", "c.csv"], "c.csv"), "lasers": (["--lasers", "estimate"], "estimate"),
-    "compass": (["--compass", "c.yaml"], "c.yaml"), "pose_grid_ms": (["--pose-grid", "10ms"], 10.0),
-    "fov_deg": (["--fov=-105:105"], (-105.0, 105.0)), "min_range_m": (["--min-range", "2.5"], 2.5),
-    "max_range_m": (["--max-range", "50"], 50.0), "crs": (["--epsg", "EPSG:3006"], "EPSG:3006"),
-    "height": (["--height", "relative"], "relative"), "geoid": (["--geoid", "29.35"], "29.35"),
+    "compass": (["--compass", "c.yaml"], "c.yaml"), "pose_grid_ms": (["--pose-grid-ms", "10ms"], 10.0),
+    "fov_deg": (["--fov-deg=-105:105"], (-105.0, 105.0)), "min_range_m": (["--min-range-m", "2.5"], 2.5),
+    "max_range_m": (["--max-range-m", "50"], 50.0), "crs": (["--epsg", "EPSG:3006"], "EPSG:3006"),
+    "crs_anyway": (["--crs-anyway"], True), "height": (["--height", "relative"], "relative"), "geoid": (["--geoid", "29.35"], "29.35"),
     "products": (["--products", "cloud.laz, pictures"], ("cloud.laz", "pictures")),
 }  # fmt: skip
 
@@ -36,6 +36,14 @@ def test_every_option_with_a_word_can_be_typed_and_nothing_typed_is_the_defaults
     assert parsed() == Survey()
     for name, (words, value) in TYPED.items():
         assert parsed(*words) == dataclasses.replace(Survey(), **{name: value}), name
+
+
+def test_an_option_is_called_as_its_key_in_the_file_is() -> None:
+    """One word for one thing in survey.yaml, on the command line and in messages; a beginning of it is enough to type."""
+    for field in dataclasses.fields(Survey):
+        words = command_of(field).words
+        assert not words or words[0] == "--" + field.name.replace("_", "-")
+    assert parsed("--pose-grid", "10ms", "--min-range", "2").pose_grid_ms == 10.0
 
 
 def test_every_field_belongs_to_one_section_in_their_order() -> None:

@@ -344,15 +344,14 @@ def test_wrong_places_are_one_sentence_each(small: Path, tmp_path: Path, capsys:
     log = tmp_path / "l.mcap"
     for words, code, what in (
         (["--pcap", text, "-o", log], 1, "is no pcap"),
-        (["--pcap", folder, "-o", log], 1, "Is a directory"),
-        (["--pcap", tmp_path / "none", "-o", log], 1, "No such file"),
+        (["--pcap", folder, "-o", log], 1, "is a folder"),
+        (["--pcap", tmp_path / "none", "-o", log], 1, "no such file"),
         (["--pcap", small, small, "-o", log], 2, "given twice"),
         (["--pcap", small, "-o", small, "--force"], 2, "is an input"),
-        (["--pcap", small, "-o", folder, "--force"], 1, "cannot be written"),
-        (["--pcap", small, "-o", tmp_path / "no" / "l.mcap"], 1, "cannot be written"),
-        (["--pcap", small, "-o", file / "l.mcap"], 1, "Not a directory"),
+        (["--pcap", small, "-o", folder, "--force"], 2, "is a folder"),
+        (["--pcap", small, "-o", file / "l.mcap"], 1, "cannot be written"),
         (["--pcap", small, "-o", "/proc/l.mcap"], 1, "cannot be written"),
-        (["--pcap", small, "-o", file], 2, "exists already"),
+        (["--pcap", small, "-o", file], 2, "expected a name that ends in .mcap"),
     ):
         got, said = run(capsys, *words)
         assert (got, said.count("\n")) == (code, 1), said

@@ -217,17 +217,24 @@ def test_a_cut_log_is_told_and_summed_up_as_far_as_it_goes(
     cut = tmp_path / "cut.mcap"
     content = monterey_log.read_bytes()
     cut.write_bytes(content[: len(content) // 2])
-    assert main(["info", str(cut), "--json"]) == 0
+    assert main(["info", str(cut), "--json"]) == 1
     summary = json.loads(capsys.readouterr().out)
     assert summary["truncated"] is True
     assert 0 < summary["lidar"]["packets"] < 2702
-    assert main(["info", str(cut)]) == 0
-    assert "cut off" in capsys.readouterr().out
+    assert summary["verdict"] == "bad"
+    assert {reason["about"] for reason in summary["verdict_reasons"]} == {"truncated", "autopilot"}
+    assert main(["info", str(cut)]) == 1
+    text = capsys.readouterr().out
+    assert "cut off" in text
+    assert text.splitlines()[-1].startswith("verdict: bad: no messages of the autopilot")
+    assert f"swath recover {cut}" in text
 
 
 def test_the_text_says_what_the_json_says(monterey_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(monterey_log)]) == 0
+    assert main(["info", str(monterey_log)]) == 1
     text = capsys.readouterr().out
+    # the lidar is of 2012, the autopilot of 2015
+    assert text.splitlines()[-1].startswith("verdict: bad: the log holds 0.0 s of lidar and autopilot together")
     for words in ("2702", "706.5 rpm", "strongest", "2 boots", "absent in 299", "aligned to UTC", "872800"):
         assert words in text
 
@@ -243,7 +250,8 @@ def test_the_keys_of_the_json_are_these(monterey_log: Path) -> None:
         summary = summarise(reader)
     assert sorted(summary) == [
         "attachments", "bytes", "damage", "duration_s", "end_utc", "file", "format_version", "gap_count", "gaps",
-        "host_clock_steps", "lidar", "mavlink", "messages_backwards", "messages_damaged", "position", "session", "start_utc",
+        "host_clock_steps", "lidar", "lidar_with_autopilot_s", "mavlink",
+        "messages_backwards", "messages_damaged", "position", "session", "start_utc",
         "topics", "truncated", "utc",
     ]  # fmt: skip
     assert sorted(summary["lidar"]) == [
@@ -258,5 +266,5 @@ def test_a_file_that_is_no_log_is_one_sentence(tmp_path: Path, capsys: pytest.Ca
     text.write_text("these are no packets\n")
     assert main(["info", str(text)]) == 1
     error = capsys.readouterr().err
-    assert "is no MCAP file" in error
+    assert "is a packet capture" in error
     assert error.count("\n") == 1

@@ -19,6 +19,8 @@ from groundproc.steps.ledger import INSIDE
 from groundproc.steps.step import steps
 
 PATIENCE_S = 300.0
+COMPLETE = (0, 3)
+"""Exit codes with which the products are there: 3 s of flight are too short to tie the clocks well."""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def log(dual_flight: Any) -> Path:
 def made(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its products, made in one go."""
     folder = tmp_path_factory.mktemp("made") / "out"
-    assert main(["process", str(log), "--method", "ins", "-o", str(folder)]) == 0
+    assert main(["process", str(log), "--method", "ins", "-o", str(folder)]) in COMPLETE
     return folder
 
 
@@ -51,7 +53,7 @@ def finished(folder: Path) -> dict[str, str]:
 def units(log: Path, folder: Path, *words: object) -> set[str]:
     """Run, and name the parts of steps that were made."""
     before = finished(folder) if (folder / INSIDE).is_dir() else {}
-    assert main(["process", str(log), "--method", "ins", *map(str, words), "-o", str(folder)]) == 0
+    assert main(["process", str(log), "--method", "ins", *map(str, words), "-o", str(folder)]) in COMPLETE
     after = finished(folder)
     return {name for name in after if before.get(name) != after[name]}
 
@@ -102,13 +104,12 @@ def test_force_does_everything_and_gives_the_same_points(log: Path, out: Path, m
         (["--min-range", "5"], {"place", "quality", "products"}),
         (["--height", "relative"], {"trajectory", "place", "quality", "products"}),
         (["--pose-grid", "10ms"], {"trajectory", "place", "quality", "products"}),
-        (["--geoid", "30"], {"trajectory", "quality", "products"}),
+        (["--height", "ellipsoid", "--geoid", "30"], {"trajectory", "place", "quality", "products"}),
     ],
 )
 def test_a_setting_concerns_the_steps_that_look_at_it(
     log: Path, out: Path, words: list[str], done: set[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A geoid is read for the trajectory; with heights above the sea it changes nothing, and so what is made of it stays."""
     said = status(capsys, log, "--method", "ins", *words, "-o", out)
     assert process(log, out, *words) == done
     stale = steps_of(name for name, state in said.items() if state["state"] == "stale")
@@ -180,11 +181,11 @@ def test_until_stops_and_the_folder_goes_on_by_its_ledger(
     assert process(log, out, "--until", "trajectory") == {"clocks", "trajectory"}
     assert not (out / "cloud.laz").exists()
     assert re.search(r"^place +missing +not made yet$", capsys.readouterr().out, re.MULTILINE)
-    assert main(["process", str(out)]) == 0
+    assert main(["process", str(out)]) in COMPLETE
     assert names(out) == names(made)
     assert (out / "cloud.laz").read_bytes() == (made / "cloud.laz").read_bytes()
     # and options may be laid over what the ledger remembers
-    assert main(["process", str(out), "--crs", "3009"]) == 0
+    assert main(["process", str(out), "--crs", "3009"]) in COMPLETE
     assert json.loads((out / "quality.json").read_text())["crs"]["epsg"] == 3009
     states = status(capsys, out)
     assert {state["state"] for state in states.values()} == {"done"}
@@ -249,7 +250,7 @@ def test_a_file_in_the_place_of_a_product_is_replaced_with_force_only(
     assert main(["process", str(out)]) == 2
     assert "--force" in capsys.readouterr().err
     assert (out / "cloud.laz").read_bytes() == b"mine"
-    assert main(["process", str(out), "--force"]) == 0
+    assert main(["process", str(out), "--force"]) in COMPLETE
     assert (out / "cloud.laz").read_bytes() != b"mine"
 
 

@@ -259,9 +259,10 @@ def test_a_worse_result_is_refused_and_leaves_nothing(
         ({"point_format": 6, "gps_s": np.zeros(1)}, [], "gps_time is 0 for all points"),
         ({"point_format": 2}, [], "have no gps_time"),
         ({"crs": False}, [], "states no CRS; give it with --crs"),
+        ({}, ["--crs", "32610"], "--crs-anyway takes it all the same"),
         ({}, ["--crs", "4326"], "a projected horizontal CRS in metres is needed"),
         ({"gps_s": np.full(1, 1e8)}, [], "lie outside of the trajectory"),
-        ({}, ["--control", "nowhere.csv"], "nowhere.csv: cannot be read"),
+        ({}, ["--control", "nowhere.csv"], "nowhere.csv: no such file"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(
