@@ -3,7 +3,6 @@
 Format: ASPRS LAS 1.4 R15, tables 3, 6 and 7.
 """
 
-import math
 import os
 import struct
 from pathlib import Path
@@ -20,6 +19,7 @@ _POINTS_PER_BYTE: Final = 8
 _SOME_POINTS: Final = 100_000
 _LARGEST_M: Final = 1e9
 """Coordinates on a map are far below."""
+_COARSEST_M: Final = 1e3
 
 
 def check(path: Path) -> None:
@@ -67,8 +67,9 @@ def _scales(head: bytes) -> str:
     """What is wrong with scales and offsets, or nothing."""
     values = struct.unpack_from("<6d", head, 131)
     for scale, offset in zip(values[:3], values[3:], strict=True):
-        if not (math.isfinite(scale) and scale > 0.0 and abs(offset) <= _LARGEST_M):
-            return f"scale {scale:g} and offset {offset:g}, expected a scale above 0 and an offset of {_LARGEST_M:g} at most"
+        if not (0.0 < scale <= _COARSEST_M and abs(offset) <= _LARGEST_M):
+            most = f"a scale above 0 to {_COARSEST_M:g} and an offset of {_LARGEST_M:g} at most"
+            return f"scale {scale:g} and offset {offset:g}, expected {most}"
     return ""
 
 

@@ -185,6 +185,8 @@ def _step(entry: Dimension, point_format: Any) -> tuple[str, float | None] | Non
     if found.num_elements != 1 or (entry.unit and f"[{entry.unit}]" not in found.description):
         return None
     own = None if found.scales is None else float(found.scales[0])
+    if not np.isfinite([own or 0.0, 0.0 if found.offsets is None else float(found.offsets[0])]).all():
+        return None
     if entry.scale is None and (own is not None or not np.can_cast(found.dtype, entry.stored, "safe")):
         return None
     return name, own
