@@ -5,7 +5,7 @@ All times here are nanoseconds since boot. A reboot inside a file begins a new s
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -15,6 +15,7 @@ from flightlog import frames, mavlink
 from flightlog.constants import NS_PER_MS, NS_PER_US
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame
+from groundproc.flight.sound import possible
 from groundproc.flight.sync import GyroTrack
 
 Array = npt.NDArray[np.float64]
@@ -61,6 +62,8 @@ class Boot:
         Message name to its table (`mavlink.table`), in order of reception, without repeats.
     stamps_ns : dict of str to ndarray of int64
         Time since boot of each row [ns]; rows without a stamp of their own have that of the stamped message before.
+    left_out : dict of str to int
+        Messages with values that cannot be, by name; see `sound`.
     """
 
     number: int
@@ -68,6 +71,7 @@ class Boot:
     component: int
     tables: dict[str, npt.NDArray[np.void]]
     stamps_ns: dict[str, npt.NDArray[np.int64]]
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def has(self, name: str, least: int = 2) -> bool:
         """Whether there are at least so many messages of a kind."""
@@ -178,15 +182,20 @@ def _running_clock_ms(mine: Sequence[Frame]) -> npt.NDArray[np.int64]:
 def _boot(number: int, address: tuple[int, int], mine: Sequence[Frame], clock_ms: npt.NDArray[np.int64]) -> Boot:
     ids = np.fromiter((f.message_id for f in mine), np.int64, len(mine))
     tables, stamps = {}, {}
+    left_out: dict[str, int] = {}
     for name in _TABLES:
         rows = np.flatnonzero(ids == mavlink.message_id(name))
         if len(rows) == 0:
             continue
         table = mavlink.table([mine[i] for i in rows.tolist()], name)
+        good = possible(table, name)
+        if not good.all():
+            left_out[name] = int((~good).sum())
+            table, rows = table[good], rows[good]
         stamp_ns = _stamps_ns(table, clock_ms[rows])
         keep = _increasing(stamp_ns)
         tables[name], stamps[name] = table[keep], stamp_ns[keep]
-    return Boot(number, *address, tables, stamps)
+    return Boot(number, *address, tables, stamps, left_out)
 
 
 def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

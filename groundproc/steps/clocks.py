@@ -1,7 +1,8 @@
 """Step clocks: read the logs but for the points, and put lidar and autopilot on one time scale."""
 
 import json
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ from flightlog.constants import HOUR_NS
 from flightlog.logfile import LogReader
 from flightlog.mount import load_mount
 from groundproc.estimation import ins
+from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
@@ -54,11 +56,20 @@ def work(run: Run, folders: Folders) -> None:
             "frames": flight.frames,
             "bad_bytes": flight.bad_bytes,
             "unknown_frames": flight.unknown,
+            "impossible": left_out(flight.boots),
         },
     }
     path = folders[WHOLE] / FOUND
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def left_out(boots: Sequence[Boot]) -> dict[str, int]:
+    """Messages with values that cannot be, by name."""
+    found: Counter[str] = Counter()
+    for boot in boots:
+        found.update(boot.left_out)
+    return dict(sorted(found.items()))
 
 
 def describe_log(reader: LogReader) -> dict[str, Any]:

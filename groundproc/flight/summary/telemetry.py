@@ -4,9 +4,12 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
+import numpy as np
+
 from flightlog import clock
 from flightlog.constants import NS_PER_S
 from flightlog.mavlink import AUTOPILOT_INVALID, Frame, message_id, payload_dtype
+from groundproc.flight import sound
 
 _WRAP_MS: Final = 1 << 32
 _REBOOT_MS: Final = 10_000
@@ -15,6 +18,9 @@ _REORDERED: Final = 128
 _HEARTBEAT: Final = message_id("HEARTBEAT")
 _SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
 _GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
+_JUDGED: Final = {message_id(name): name for name in sound.LARGEST}
+_TOGETHER: Final = 500
+"""Messages whose values are looked at in one go."""
 _BOOT_TIMED: Final = tuple(message_id(name) for name in ("SYSTEM_TIME", "ATTITUDE", "GLOBAL_POSITION_INT"))
 
 
@@ -58,6 +64,9 @@ class TelemetrySummary:
     first_utc_ns: int | None = None
     fix_type: int | None = None
     satellites: int | None = None
+    impossible: dict[str, int] = field(default_factory=dict)
+    """Messages with values that cannot be, by name."""
+    _waiting: dict[int, list[bytes]] = field(default_factory=dict)
 
     def add(self, frame: Frame) -> None:
         """Take the next frame; one outside the dialect counts nothing, its sender is not proven."""
@@ -77,18 +86,38 @@ class TelemetrySummary:
         elif frame.message_id == _GPS_RAW_INT:
             self.fix_type = max(self.fix_type or 0, _value(frame, "fix_type"))
             self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
+        if frame.message_id in _JUDGED:
+            self._judge(frame)
         if frame.message_id in _BOOT_TIMED:
             _boot(node, frame.time_ns, _value(frame, "time_boot_ms"))
         if frame.message_id == _SYSTEM_TIME and self.first_utc_ns is None:
             self.first_utc_ns = _value(frame, "time_unix_usec") * 1000 or None
 
+    def _judge(self, frame: Frame) -> None:
+        waiting = self._waiting.setdefault(frame.message_id, [])
+        waiting.append(frame.payload)
+        if len(waiting) >= _TOGETHER:
+            self._judge_waiting()
+
+    def _judge_waiting(self) -> None:
+        """Count the messages with values that cannot be, among those not looked at yet."""
+        for number, payloads in self._waiting.items():
+            dtype, name = payload_dtype(number), _JUDGED[number]
+            packed = b"".join(payload[: dtype.itemsize].ljust(dtype.itemsize, b"\x00") for payload in payloads)
+            bad = int((~sound.possible(np.frombuffer(packed, dtype), name)).sum())
+            if bad:
+                self.impossible[name] = self.impossible.get(name, 0) + bad
+        self._waiting.clear()
+
     def result(self, bad_bytes: int, unknown: int) -> dict[str, Any]:
         """The figures; see `swath info --json`."""
+        self._judge_waiting()
         autopilots = {key: node for key, node in self.nodes.items() if node.is_autopilot}
         return {
             "frames": self.frames,
             "unknown_frames": unknown,
             "bad_bytes": bad_bytes,
+            "impossible": dict(sorted(self.impossible.items())),
             "lost_frames": sum(node.lost for node in autopilots.values()),
             "autopilots": [_autopilot(key, node) for key, node in autopilots.items()],
             "reboots": sum(max(len(node.boots) - 1, 0) for node in autopilots.values()),

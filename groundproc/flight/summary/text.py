@@ -96,6 +96,9 @@ def _position(position: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _mavlink(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "frames", f"{mavlink['frames']}, {mavlink['unknown_frames']} of unknown kind"
     yield "bad bytes", str(mavlink["bad_bytes"])
+    if mavlink["impossible"]:
+        counts = ", ".join(f"{count} {name}" for name, count in mavlink["impossible"].items())
+        yield "left out", f"{counts}: values that cannot be"
     for autopilot in mavlink["autopilots"]:
         name = f"autopilot {autopilot['system']}/{autopilot['component']}"
         yield name, f"{len(autopilot['boots'])} boots, {autopilot['lost_frames']} frames lost on the way"
