@@ -17,6 +17,8 @@ OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
 _INTERRUPTED: Final = 128 + signal.SIGINT
 _TERMINATED: Final = 128 + signal.SIGTERM
 _BROKEN_PIPE: Final = 128 + signal.SIGPIPE
+_LONGEST: Final = 4000
+"""Characters of a sentence on the terminal."""
 
 
 @cache
@@ -46,8 +48,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _BROKEN_PIPE
     except Exception as error:  # `_outside` raises again what is a mistake of ours
         sentence, code = _outside(error)
-        print(f"swath: {sentence}", file=sys.stderr)
+        _say(sentence)
     return code
+
+
+def _say(sentence: str) -> None:
+    """One line on the terminal, whatever the words of a file in it hold."""
+    from flightlog.words import clean
+
+    print(f"swath: {clean(sentence, _LONGEST)}", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -89,7 +98,12 @@ def _dispatch(words: list[str]) -> int:
         module = point.load()
         parser = argparse.ArgumentParser(prog=f"swath {point.name}", description=module.HELP)
         module.add_arguments(parser)
-        return int(module.run(parser.parse_args(words[1:])))
+        arguments = parser.parse_args(words[1:])
+        # imported late, as the command itself: `swath --help` can do without
+        from groundproc.screen import cleaned
+
+        with cleaned():
+            return int(module.run(arguments))
     parser = argparse.ArgumentParser(
         prog="swath",
         description="Turns flight logs into point clouds.",

@@ -80,6 +80,7 @@ def _captures(arguments: argparse.Namespace) -> int:
     """Import captures of the network."""
     from tqdm import tqdm
 
+    from flightlog.words import clean
     from groundproc.flight.importers.flight import import_flight
     from groundproc.flight.importers.sources import Ports
 
@@ -94,7 +95,7 @@ def _captures(arguments: argparse.Namespace) -> int:
             progress=bar.update,
         )
     for note in result.notes:
-        print(f"swath: note: {note}", file=sys.stderr)
+        print(f"swath: note: {clean(note)}", file=sys.stderr)
     print(
         f"{arguments.output}: {result.lidar_packets} lidar and {result.position_packets} position packets, "
         f"{result.mavlink_frames} MAVLink frames"

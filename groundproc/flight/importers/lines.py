@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from flightlog.errors import LogError
 from flightlog.records import line_dtype
+from groundproc.arrays import read_arrays
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -35,7 +36,7 @@ def read_lines(path: Path) -> npt.NDArray[np.void]:
     """
     try:
         tables = _npz(path) if path.suffix.lower() == ".npz" else _csv(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, OverflowError) as error:
         raise LogError(
             f"{path}: cannot be read as lines of a scanner ({error}); expected {', '.join(SCAN_COLUMNS)}"
         ) from None
@@ -63,9 +64,9 @@ def read_lines(path: Path) -> npt.NDArray[np.void]:
 
 
 def _npz(path: Path) -> tuple[Times, Array, Array, Array, float]:
-    with np.load(path, allow_pickle=False) as found:
-        step = float(found["shot_step_s"]) if "shot_step_s" in found else 0.0
-        time_ns, angle, ranges, intensity = (np.asarray(found[name]) for name in SCAN_COLUMNS)
+    found = read_arrays(path)
+    step = float(found["shot_step_s"]) if "shot_step_s" in found else 0.0
+    time_ns, angle, ranges, intensity = (found[name] for name in SCAN_COLUMNS)
     return time_ns.astype(np.int64), angle, ranges, intensity, step
 
 
@@ -94,7 +95,7 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
         columns = _columns(path, IMU_COLUMNS)
         values = np.stack([column.astype(np.float64) for column in columns[1:]], axis=1)
         time_ns = columns[0].astype(np.int64)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, OverflowError) as error:
         raise LogError(
             f"{path}: cannot be read as an IMU's samples ({error}); expected {', '.join(IMU_COLUMNS)}"
         ) from None

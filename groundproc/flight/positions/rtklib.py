@@ -226,7 +226,7 @@ def _row(line: str, header: _Header) -> tuple[int, list[float]] | None:
         else:
             time_ns, words = _week_ns(words[0], words[1]), words[2:]
         values = [float(word) for word in words]
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         return None
     if len(values) != len(header.names) or not all(map(math.isfinite, values)) or not 0 <= time_ns < _LATEST_NS:
         return None

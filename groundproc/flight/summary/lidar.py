@@ -146,7 +146,11 @@ class LidarSummary:
         }
 
     def _mode(self) -> str | None:
-        names = [self.model.mode_names[mode] for mode, _ in sorted(self.modes.items(), key=lambda item: -item[1])]
+        known = self.model.mode_names
+        modes = sorted(self.modes, key=lambda mode: -self.modes[mode])
+        names = [known[mode] for mode in modes if mode in known]
+        if unknown := len(modes) - len(names):
+            names.append(f"{unknown} unknown")
         return " and ".join(names) if names else None
 
     def _packet_ns(self) -> int:

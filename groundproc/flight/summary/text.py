@@ -1,12 +1,17 @@
 """The figures of a log as text for a pilot."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
+
+from flightlog.words import clean
+
+_LONGEST: Final = 300
+"""Characters of a value: names of topics and attachments are the file's own words."""
 
 
 def as_text(summary: dict[str, Any]) -> str:
     """Lines of text for what `summary.log.summarise` gives."""
-    lines = [f"{summary['file']}: {_size(summary['bytes'])}, {summary['duration_s']} s"]
+    lines = [f"{clean(summary['file'])}: {_size(summary['bytes'])}, {summary['duration_s']} s"]
     lines += _section("log", _log(summary))
     if summary["lidar"] is not None:
         lines += _section("lidar", _lidar(summary))
@@ -20,7 +25,7 @@ def as_text(summary: dict[str, Any]) -> str:
 
 
 def _section(title: str, rows: Iterator[tuple[str, str]]) -> list[str]:
-    return ["", title, *(f"  {name:<22}{text}" for name, text in rows)]
+    return ["", clean(title), *(f"  {clean(name):<22}{clean(text, _LONGEST)}" for name, text in rows)]
 
 
 def _size(count: int) -> str:
