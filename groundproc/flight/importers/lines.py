@@ -67,6 +67,10 @@ def _npz(path: Path) -> tuple[Times, Array, Array, Array, float]:
     found = read_arrays(path)
     step = float(found["shot_step_s"]) if "shot_step_s" in found else 0.0
     time_ns, angle, ranges, intensity = (found[name] for name in SCAN_COLUMNS)
+    if (time_ns.ndim, angle.ndim) != (1, 1) or any(
+        array.dtype.kind not in "iuf" for array in (time_ns, angle, ranges, intensity)
+    ):
+        raise ValueError("arrays of other shapes or kinds")
     return time_ns.astype(np.int64), angle, ranges, intensity, step
 
 

@@ -174,6 +174,7 @@ def tidied(solution: Solution, place: str) -> Solution:
             & (solution.height_m > _LOWEST_M)
             & (solution.height_m < _HIGHEST_M)
         )
+    possible &= _within(solution)
     _count(left_out, "without_fix", int((~fixed).sum()))
     _count(left_out, "impossible", int((fixed & ~possible).sum()))
     kept = solution.rows(fixed & possible)
@@ -186,6 +187,22 @@ def tidied(solution: Solution, place: str) -> Solution:
         reasons = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in left_out.items()) or "it has no rows"
         raise LogError(f"{place}: holds no position ({reasons})")
     return dataclasses.replace(kept, left_out=left_out)
+
+
+_LARGEST: Final = {
+    "covariance_m2": 1e12, "undulation_m": 200.0, "velocity_m_s": 1e4, "velocity_covariance_m2_s2": 1e8, "attitude_covariance_rad2": 1e6,
+}  # fmt: skip
+"""Magnitudes that cannot be exceeded by what a row says beside its place; not a number: it does not say."""
+
+
+def _within(solution: Solution) -> npt.NDArray[np.bool_]:
+    """Which rows say nothing that cannot be, shape (n,)."""
+    good = np.ones(len(solution), np.bool_)
+    for name, most in _LARGEST.items():
+        values = getattr(solution, name)
+        if values is not None:
+            good &= (~(np.abs(values) > most)).reshape(len(good), -1).all(axis=1)
+    return good
 
 
 def _count(left_out: dict[str, int], reason: str, number: int) -> None:

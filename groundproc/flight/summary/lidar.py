@@ -5,6 +5,7 @@ limited, so that it never sent it; or it was lost. The stamps say how many are m
 would have looked, and that tells the reasons apart.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -87,6 +88,8 @@ class LidarSummary:
         for name in account.__slots__:
             if not name.startswith("fov"):
                 self.totals[name] = self.totals.get(name, 0) + int(getattr(account, name))
+        if not math.isfinite(account.fov_start_deg + account.fov_end_deg):
+            return
         start, end = (round(a * 100) % AZIMUTH_STEPS for a in (account.fov_start_deg, account.fov_end_deg))
         if start != end:
             self.window = (start, end)
