@@ -49,7 +49,7 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> npt.NDArray[Any]
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(file, _LONGEST_HEAD)
         size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or size > entry.file_size:
+        if dtype.hasobject or min(shape, default=0) < 0 or size > entry.file_size:
             raise ValueError(f"{entry.filename}: {dtype} of shape {shape} in {entry.file_size} bytes")
         data = file.read(size)
         if len(data) < size:

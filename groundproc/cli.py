@@ -88,10 +88,16 @@ def _outside(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         reason = error.strerror or str(error)
         return (f"{error.filename}: {reason}" if error.filename else reason), 1
+    if isinstance(error, ValueError) and "null byte" in str(error):  # what open() says of a name
+        return "a name of a file that was given, here or in a configuration, holds a zero byte", 2
     raise error
 
 
 def _dispatch(words: list[str]) -> int:
+    if nul := next((word for word in words if "\x00" in word), None):
+        from flightlog.errors import UsageError
+
+        raise UsageError(f"{nul!r} found, expected words without zero bytes")
     found = commands()
     if words and words[0] in found:
         point = found[words[0]]

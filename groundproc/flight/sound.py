@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 _TURN: Final = 2.0 * np.pi + 0.01
-_RATE_RAD_S: Final = 200.0
+RATE_RAD_S: Final = 200.0
 """Gyros of autopilots measure a fifth of this."""
-_FORCE_M_S2: Final = 5_000.0
+FORCE_M_S2: Final = 5_000.0
 _DEG_E7: Final = {"lat": 90e7, "lon": 180e7}
 _HEIGHT_MM: Final = 1e8
 _LATEST_US: Final = 4_102_444_800e6
@@ -22,13 +22,13 @@ _UNIT: Final = 0.1
 """A quaternion's length may be off 1 by this."""
 
 _ATTITUDE: Final = dict.fromkeys(("roll", "pitch", "yaw"), _TURN)
-_RATES: Final = dict.fromkeys(("rollspeed", "pitchspeed", "yawspeed"), _RATE_RAD_S)
+_RATES: Final = dict.fromkeys(("rollspeed", "pitchspeed", "yawspeed"), RATE_RAD_S)
 LARGEST: Final[Mapping[str, Mapping[str, float]]] = {
     "ATTITUDE": _ATTITUDE | _RATES,
     "ATTITUDE_QUATERNION": _RATES,
     "AHRS2": _ATTITUDE,
-    "HIGHRES_IMU": dict.fromkeys(("xgyro", "ygyro", "zgyro"), _RATE_RAD_S)
-    | dict.fromkeys(("xacc", "yacc", "zacc"), _FORCE_M_S2),
+    "HIGHRES_IMU": dict.fromkeys(("xgyro", "ygyro", "zgyro"), RATE_RAD_S)
+    | dict.fromkeys(("xacc", "yacc", "zacc"), FORCE_M_S2),
     "GLOBAL_POSITION_INT": _DEG_E7 | dict.fromkeys(("alt", "relative_alt"), _HEIGHT_MM),
     "GPS_RAW_INT": _DEG_E7 | dict.fromkeys(("alt", "alt_ellipsoid"), _HEIGHT_MM),
     "SCALED_PRESSURE": {"press_abs": 2_000.0},

@@ -87,26 +87,19 @@ def hostile_log(path: Path) -> None:
             stream, metadata={"swath.session": {"version": word, "software": word + "x" * 100_000, "origin": word}},
             attachments={word: b"x"}, library=word,
         )  # fmt: skip
-        for topic in (f"/mavlink/{word}", f"/{word}" + "x" * 50_000):
+        for topic in (f"/mavlink/{word}", f"/mavlink/{word}" + "x" * 50_000):
             writer.write(topic, seeds.START_NS, b"nothing")
         writer.finish()
 
 
-@pytest.mark.parametrize(
-    "words", [("info",), ("info", "--json"), ("recover", "-o", "{out}"), ("decode", "-o", "{out}.laz")]
-)
-def test_words_of_a_log_reach_the_terminal_harmless_and_short(tmp_path: Path, words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("command", ["info", "info json", "recover", "decode"])
+def test_words_of_a_log_reach_the_terminal_harmless_and_short(tmp_path: Path, command: str) -> None:
     path = tmp_path / "a.mcap"
     hostile_log(path)
-    line = [*SWATH, *(word.format(out=tmp_path / "out") for word in words), str(path)]
-    done = subprocess.run(line, capture_output=True, check=False, timeout=300)
-    said = done.stdout + done.stderr
-    assert b"Traceback" not in said
-    assert not set(said) & (set(range(32)) - {10} | {127})
-    assert not any(text.startswith(b"swath: all is well") for text in said.splitlines())
-    if "--json" not in words:
-        assert "\u202e" not in said.decode()
-        assert len(said) < fuzzing.MOST_TEXT
+    (door,) = (door for door in fuzzing.doors() if door.name == command)
+    what, code = fuzzing.ask(door, path, tmp_path)
+    assert code == (1 if command == "decode" else 0)
+    assert not what or (command == "info json" and "characters" in what), what
 
 
 def test_names_of_files_and_keys_of_yaml_reach_the_terminal_harmless(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from flightlog.errors import LogError
 from flightlog.records import line_dtype
 from groundproc.arrays import read_arrays
+from groundproc.flight.sound import FORCE_M_S2, RATE_RAD_S
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -17,6 +18,7 @@ SCAN_COLUMNS: Final = ("time_ns", "angle_deg", "range_m", "intensity")
 IMU_COLUMNS: Final = (
     "time_ns", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2",
 )  # fmt: skip
+_LARGEST: Final = np.repeat([RATE_RAD_S, FORCE_M_S2], 3)
 _UNEVEN_RAD: Final = np.deg2rad(0.02)
 """Angles of a line may be off an even spacing by this: they are stated to 0.01 deg."""
 _DEFAULT_LINE_S: Final = 1.0 / 18.0
@@ -105,8 +107,8 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
         ) from None
     if len(time_ns) < 2 or (np.diff(time_ns) <= 0).any():
         raise LogError(f"{path}: {len(time_ns)} samples, expected at least 2, of growing times")
-    if not np.isfinite(values).all():
-        raise LogError(f"{path}: a sample is not a number")
+    if not (np.abs(values) <= _LARGEST).all():
+        raise LogError(f"{path}: a sample is no number, or above {RATE_RAD_S:g} rad/s or {FORCE_M_S2:g} m/s^2")
     return time_ns, values[:, :3], values[:, 3:]
 
 

@@ -35,6 +35,8 @@ _LARGEST: Final = {
     "z_velocity": 1e4, "roll": 7.0, "pitch": 7.0, "platform_heading": 7.0, "wander_angle": 7.0,
 }  # fmt: skip
 """Magnitudes that values cannot exceed; angles are written within a turn."""
+_LARGEST_SIGMA: Final = 1e5
+"""Metres, metres a second or minutes of arc: what is larger, or no number, is not stated."""
 _MOST: Final = 0.9
 """This part of the first records must be sound for a file to be taken for an SBET."""
 _LONGEST_STEP_S: Final = 60.0
@@ -206,7 +208,8 @@ def _covariances(time_s: Array, accuracy: Path | None, path: Path) -> tuple[Arra
         )
 
     def at(*names: str) -> Array:
-        return np.stack([np.interp(time_s, records["time"], records[name]) for name in names], axis=-1)
+        columns = (np.where(np.abs(records[name]) <= _LARGEST_SIGMA, records[name], np.nan) for name in names)
+        return np.stack([np.interp(time_s, records["time"], column) for column in columns], axis=-1)
 
     angle = at("roll", "pitch", "heading") * _MINUTE_RAD
     return (

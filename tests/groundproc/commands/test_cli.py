@@ -90,3 +90,8 @@ def test_a_library_that_is_not_installed_is_one_sentence_and_a_mistake_of_ours_i
     without("groundproc.nothing")
     with pytest.raises(ModuleNotFoundError):
         cli.main(["info"])
+
+
+def test_a_word_with_a_zero_byte_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "a\0b.mcap"]) == 2
+    assert capsys.readouterr().err == "swath: 'a\\x00b.mcap' found, expected words without zero bytes\n"
