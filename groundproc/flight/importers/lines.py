@@ -119,7 +119,8 @@ def _columns(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[np.str_]]:
         missing = [name for name in names if name not in head]
         if missing:
             raise KeyError(f"no column {missing[0]}")
-        table = np.loadtxt(file, delimiter=",", dtype=np.str_, ndmin=2, usecols=[head.index(name) for name in names])
+        lines = (line for line in file if line.strip())
+        table = np.loadtxt(lines, delimiter=",", dtype=np.str_, ndmin=2, usecols=[head.index(name) for name in names])
     if not len(table):
         raise ValueError("no rows")
     return list(table.T)
