@@ -4,7 +4,7 @@ There is one list of options, the dataclass; the commented sample file is made f
 """
 
 import dataclasses
-import math
+import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -167,8 +167,8 @@ def _convert_tuple(value: Any, arms: tuple[Any, ...], rules: Mapping[str, Any], 
 def _scalar(value: Any, hint: Any, place: str) -> Any:
     names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not math.isfinite(value):
-            raise ConfigError(f"{place}: {value!r} found, expected a finite number")
+        if not abs(value) <= sys.float_info.max:  # a whole number may be larger, and none is infinite
+            raise ConfigError(f"{place}: {_shown(value)} found, expected a finite number")
         return float(value)
     if hint is Any or (isinstance(value, hint) and isinstance(value, bool) == (hint is bool)):
         return value

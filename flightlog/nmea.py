@@ -9,6 +9,7 @@ from flightlog.constants import NS_PER_S
 
 _CLOCK: Final = re.compile(r"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9]|60)(\.[0-9]{1,9})?", re.ASCII)
 _DATE: Final = re.compile(r"([0-9]{2})([0-9]{2})([0-9]{2})", re.ASCII)
+_FASTEST_M_S: Final = 10_000.0
 _TOP_YEAR: Final = 80
 """Two-digit years from here on are of the 1900s: GPS began in 1980."""
 
@@ -61,7 +62,7 @@ def _parse_fields(words: list[str]) -> Rmc:
     whole = midnight + timedelta(hours=int(clock[1]), minutes=int(clock[2]), seconds=int(clock[3]))
     fraction_ns = int((clock[4] or ".")[1:].ljust(9, "0"))
     utc_ns = round(whole.timestamp()) * NS_PER_S + fraction_ns
-    return Rmc(
+    found = Rmc(
         utc_ns=utc_ns,
         valid=words[2] == "A",
         latitude_deg=_angle(words[3], 2) * (-1 if words[4] == "S" else 1),
@@ -69,6 +70,15 @@ def _parse_fields(words: list[str]) -> Rmc:
         speed_m_s=float(words[7] or 0) * 1852 / 3600,
         course_deg=float(words[8] or 0),
     )
+    if not _is_possible(found):
+        raise ValueError
+    return found
+
+
+def _is_possible(found: Rmc) -> bool:
+    """Whether it is a place on Earth, and a speed and a course that can be; `float` also reads nan, inf and 1e300."""
+    on_earth = abs(found.latitude_deg) <= 90.0 and abs(found.longitude_deg) <= 180.0
+    return on_earth and abs(found.speed_m_s) <= _FASTEST_M_S and abs(found.course_deg) <= 720.0
 
 
 def _angle(text: str, degree_digits: int) -> float:

@@ -9,6 +9,7 @@ from typing import Final
 
 _SHOWN_AS_TEXT: Final = frozenset(("Ll", "Lu", "Lt", "Lm", "Lo", "Mn", "Mc", "Nd", "Nl", "No", "Sm", "Sc", "Sk", "So"))
 _MOST: Final = 2000
+_LAYOUT: Final = "\n\t\r"
 
 
 def clean(text: str, most: int = _MOST) -> str:
@@ -28,6 +29,13 @@ def clean(text: str, most: int = _MOST) -> str:
     if text.isascii() and text.isprintable():
         return text
     return "".join(character if _is_harmless(character) else _escaped(character) for character in text)
+
+
+def clean_output(text: str) -> str:
+    """Text on its way to a terminal: as `clean`, but uncut, and with line feeds, tabs, and the carriage returns of progress bars."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(one if one in _LAYOUT or _is_harmless(one) else _escaped(one) for one in text)
 
 
 def clean_bytes(raw: bytes, most: int = _MOST) -> str:

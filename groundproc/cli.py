@@ -18,6 +18,8 @@ OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
 _INTERRUPTED: Final = 128 + signal.SIGINT
 _TERMINATED: Final = 128 + signal.SIGTERM
 _BROKEN_PIPE: Final = 128 + signal.SIGPIPE
+_LONGEST: Final = 4000
+"""Characters of a sentence on the terminal."""
 
 
 @cache
@@ -70,8 +72,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _BROKEN_PIPE
     except Exception as error:  # `_outside` raises again what is a mistake of ours
         sentence, code = _outside(error)
-        print(f"swath: {sentence}", file=sys.stderr)
+        _say(sentence)
     return code
+
+
+def _say(sentence: str) -> None:
+    """One line on the terminal, whatever the words of a file in it hold."""
+    from flightlog.words import clean
+
+    print(f"swath: {clean(sentence, _LONGEST)}", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -103,10 +112,16 @@ def _outside(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         reason = error.strerror or str(error)
         return (f"{error.filename}: {reason}" if error.filename else reason), 1
+    if isinstance(error, ValueError) and "null byte" in str(error):  # what open() says of a name
+        return "a name of a file that was given, here or in a configuration, holds a zero byte", 2
     raise error
 
 
 def _dispatch(words: list[str]) -> int:
+    if nul := next((word for word in words if "\x00" in word), None):
+        from flightlog.errors import UsageError
+
+        raise UsageError(f"{nul!r} found, expected words without zero bytes")
     found = commands()
     if words[:1] == ["help"]:  # as many programs have it
         words = [*words[1:2], "--help"]
@@ -115,7 +130,12 @@ def _dispatch(words: list[str]) -> int:
         module = point.load()
         parser = Parser(prog=f"swath {point.name}", description=module.HELP)
         module.add_arguments(parser)
-        return int(module.run(parser.parse_args(words[1:])))
+        arguments = parser.parse_args(words[1:])
+        # imported late, as the command itself: `swath --help` can do without
+        from groundproc.screen import cleaned
+
+        with cleaned():
+            return int(module.run(arguments))
     parser = Parser(
         prog="swath",
         description="Turns flight logs into point clouds.",

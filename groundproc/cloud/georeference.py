@@ -252,3 +252,13 @@ def extent(xyz_m: Any) -> Any:
             low[axis] = min(low[axis], xyz_m[i, axis])
             high[axis] = max(high[axis], xyz_m[i, axis])
     return low, high
+
+
+@njit(cache=True)
+def strays(xyz_m: Any, most_m: float) -> Any:
+    """Number of points, shape (n, 3), with a coordinate that is no number or beyond so much either way."""
+    found = 0
+    for i in range(xyz_m.shape[0]):
+        if not (abs(xyz_m[i, 0]) <= most_m and abs(xyz_m[i, 1]) <= most_m and abs(xyz_m[i, 2]) <= most_m):
+            found += 1
+    return found

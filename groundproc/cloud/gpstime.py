@@ -35,6 +35,10 @@ def gps_time_s(utc_ns: Times) -> Array:
     return np.asarray((utc_ns + shift_ns) * 1e-9)
 
 
+_FARTHEST_S: Final = 7e9
+"""Beyond this, in the year 2233, nanoseconds are too many for 64 bits."""
+
+
 @dataclass(frozen=True, slots=True)
 class Clock:
     """How the stamps of a file become UTC.
@@ -58,7 +62,7 @@ class Clock:
         CaptureError
             The stamps are no times, or the week is not known.
         """
-        if not np.isfinite(time_s).all() or not (time_s != 0.0).any():
+        if not (np.abs(time_s) <= _FARTHEST_S).all() or not (time_s != 0.0).any():
             raise CaptureError(f"{path}: gps_time is {_example(time_s)}, expected the time of each point")
         if week_time:
             if self.week is None and self.near_utc_ns is None:
@@ -84,4 +88,6 @@ def is_week_time(time_s: Array) -> bool:
 
 
 def _example(time_s: Array) -> str:
-    return "0 for all points" if not time_s.any() else "no number for some points"
+    if not time_s.any():
+        return "0 for all points"
+    return f"{time_s[int(np.argmin(np.abs(time_s) <= _FARTHEST_S))]:g} for some points"

@@ -1,8 +1,10 @@
 """The stage that makes the cloud: every shot given its pose, placed, projected and handed on; and what became of each."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
+
+import numpy as np
 
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
@@ -12,6 +14,9 @@ from groundproc.cloud import georeference
 from groundproc.cloud.points import Dropped, Points
 from groundproc.sensors.shots import Shots
 from groundproc.trajectory.trajectory import Trajectory
+
+FARTHEST_M: Final = 1e6
+"""From the origin of the flight's frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +68,7 @@ def place(
         sink.begin()
     count, dropped = 0, Dropped()
     for some in shots:
-        points = georeference.georeference(some, trajectory, mount)
+        points = without_strays(georeference.georeference(some, trajectory, mount))
         dropped = dropped + points.dropped
         if len(points):
             count += len(points)
@@ -78,6 +83,18 @@ def place(
     for sink in sinks:
         sink.finish()
     return Placed(count, dropped)
+
+
+def without_strays(points: Points) -> Points:
+    """Points of the flight's frame whose places can be; the others are counted.
+
+    Whatever a trajectory holds, no product gets a place that is no number: it would spoil extents and rasters.
+    """
+    count = int(georeference.strays(points.xyz_m, FARTHEST_M))
+    if not count:
+        return points
+    kept = points.masked(np.asarray((np.abs(points.xyz_m) <= FARTHEST_M).all(axis=1)))
+    return replace(kept, dropped=replace(points.dropped, impossible=points.dropped.impossible + count))
 
 
 def project(points: Points, projection: geodesy.Projection) -> None:

@@ -26,12 +26,15 @@ class Dropped:
     no_return : int
     out_of_range : int
         A return outside the range gate.
+    impossible : int
+        Its place is no number, or far beyond any flight.
     """
 
     no_pose: int = 0
     outside_fov: int = 0
     no_return: int = 0
     out_of_range: int = 0
+    impossible: int = 0
 
     def __add__(self, other: "Dropped") -> "Dropped":
         return Dropped(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))

@@ -1,6 +1,8 @@
 """Clouds from LAS and LAZ files of any version and point format, ours and other programs': `Points` in chunks, in the order of the file."""
 
 import contextlib
+import logging
+import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +16,26 @@ from laspy.header import GpsTimeType
 from pyproj.exceptions import CRSError
 
 from flightlog.errors import CaptureError
+from flightlog.words import clean
+from groundproc.cloud import lashead, laz
 from groundproc.cloud.dimensions import TABLE, Dimension, in_order
 from groundproc.cloud.gpstime import Clock, is_week_time
 from groundproc.cloud.points import Points
 
 CHUNK: Final = 1_000_000
-"""Points that are in memory at once."""
-DAMAGE: Final = (laspy.errors.LaspyException, ValueError, RuntimeError, EOFError, OverflowError)
-"""What laspy and lazrs raise for damaged files; lazrs' own error is a RuntimeError."""
+"""Points that are in memory at once, unless they are very large."""
+_CHUNK_BYTES: Final = 64 << 20
+_FARTHEST_M: Final = 1e8
+"""Coordinates on a map are below this, false eastings with the number of a zone included."""
+_LONGEST_CRS: Final = 1 << 16
+_LONGEST_REASON: Final = 200
+DAMAGE: Final = (
+    laspy.errors.LaspyException, ValueError, RuntimeError, EOFError, ArithmeticError, LookupError, TypeError, AttributeError,
+    AssertionError, struct.error,
+)  # fmt: skip
+"""What laspy raises for damaged files: errors of its own, and whatever its code runs into."""
+# what it has to say becomes errors here; it would write to the terminal, in the words of the file
+logging.getLogger("laspy").setLevel(logging.CRITICAL + 1)
 _LEGACY: Final = {"scan_angle": ("scan_angle_rank", 1.0)}
 """Fields of point formats 0 to 5 that have another name, and a step in the unit of the table."""
 
@@ -85,10 +99,7 @@ def look(path: Path) -> Cloud:
         header = reader.header
         if header.point_count == 0:
             raise CaptureError(f"{path}: holds no points")
-        try:
-            crs = header.parse_crs()
-        except CRSError as error:
-            raise CaptureError(f"{path}: its CRS cannot be understood ({error})") from None
+        crs = _crs(path, header)
         columns = tuple(entry.name for entry in TABLE if _step(entry, header.point_format) is not None)
         timed = "gps_time" in header.point_format.dimension_names
         weekly = timed and header.global_encoding.gps_time_type != GpsTimeType.STANDARD
@@ -122,7 +133,7 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
         seen = 0
         for record in _records(cloud.path, reader):
             seen += len(record)
-            xyz = np.stack([record.x, record.y, record.z], axis=1).astype(np.float64)
+            xyz = _places(cloud.path, record)
             time_ns = np.zeros(len(record), np.int64)
             if clock is not None:
                 time_s = np.asarray(record.gps_time, np.float64)
@@ -132,6 +143,30 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
             yield Chunk(Points(time_ns, xyz, values), record)
         if seen != cloud.points:
             raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
+
+
+def _crs(path: Path, header: Any) -> pyproj.CRS | None:
+    """The CRS that a file states, if any."""
+    records = [*header.vlrs, *(header.evlrs or ())]
+    size = sum(len(record.record_data_bytes()) for record in records if record.user_id == "LASF_Projection")
+    if size > _LONGEST_CRS:
+        raise CaptureError(f"{path}: states its CRS in {size} bytes, expected {_LONGEST_CRS} at most")
+    try:
+        found: pyproj.CRS | None = header.parse_crs()
+    except CRSError as error:
+        raise CaptureError(f"{path}: its CRS cannot be understood ({sentence(error)})") from None
+    except DAMAGE as error:
+        raise CaptureError(f"{path}: its CRS is damaged ({sentence(error)})") from None
+    return found
+
+
+def _places(path: Path, record: Any) -> npt.NDArray[np.float64]:
+    """Coordinates, shape (n, 3); those of a file whose offsets or scales are damaged are beyond any map."""
+    xyz = np.stack([record.x, record.y, record.z], axis=1).astype(np.float64)
+    farthest = float(np.abs(xyz).max(initial=0.0))
+    if not farthest <= _FARTHEST_M:
+        raise CaptureError(f"{path}: a point has the coordinate {farthest:g}, expected {_FARTHEST_M:g} at most")
+    return xyz
 
 
 def _step(entry: Dimension, point_format: Any) -> tuple[str, float | None] | None:
@@ -150,6 +185,8 @@ def _step(entry: Dimension, point_format: Any) -> tuple[str, float | None] | Non
     if found.num_elements != 1 or (entry.unit and f"[{entry.unit}]" not in found.description):
         return None
     own = None if found.scales is None else float(found.scales[0])
+    if not np.isfinite([own or 0.0, 0.0 if found.offsets is None else float(found.offsets[0])]).all():
+        return None
     if entry.scale is None and (own is not None or not np.can_cast(found.dtype, entry.stored, "safe")):
         return None
     return name, own
@@ -173,7 +210,7 @@ def _column(entry: Dimension, record: Any) -> npt.NDArray[Any]:
 
 
 def _records(path: Path, reader: Any) -> Iterator[Any]:
-    points = reader.chunk_iterator(CHUNK)
+    points = reader.chunk_iterator(_at_once(reader.header))
     while True:
         try:
             record = next(points)
@@ -182,6 +219,11 @@ def _records(path: Path, reader: Any) -> Iterator[Any]:
         except DAMAGE as error:
             raise CaptureError(f"{path}: is damaged ({sentence(error)})") from None
         yield record
+
+
+def _at_once(header: Any) -> int:
+    """Points that are read at once."""
+    return min(CHUNK, max(1, _CHUNK_BYTES // int(header.point_format.size)))
 
 
 @contextlib.contextmanager
@@ -194,7 +236,9 @@ def opened(path: Path) -> Iterator[Any]:
         It cannot be read, or is no LAS file.
     """
     try:
+        lashead.check(path)
         reader = laspy.open(path)
+        reader.laz_backend = laz.Backend(path, _at_once(reader.header))
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from None
     except DAMAGE as error:
@@ -205,4 +249,4 @@ def opened(path: Path) -> Iterator[Any]:
 
 def sentence(error: BaseException) -> str:
     """What an error of laspy says, on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    return clean(" ".join(str(error).split()), _LONGEST_REASON) or type(error).__name__

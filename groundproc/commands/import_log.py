@@ -123,6 +123,7 @@ def _captures(arguments: argparse.Namespace) -> int:
     """Import recordings of the network, of ground stations, of autopilots and of ROS."""
     from tqdm import tqdm
 
+    from flightlog.words import clean
     from groundproc.flight.importers.flight import Recordings, import_flight
 
     with tqdm(unit="B", unit_scale=True, desc="import", disable=not sys.stderr.isatty()) as bar:
@@ -136,7 +137,7 @@ def _captures(arguments: argparse.Namespace) -> int:
             progress=bar.update,
         )
     for note in result.notes:
-        print(f"swath: note: {note}", file=sys.stderr)
+        print(f"swath: note: {clean(note)}", file=sys.stderr)
     dataflash = f", {result.dataflash_bytes} bytes of dataflash logs" if result.dataflash_bytes else ""
     print(
         f"{arguments.output}: {result.lidar_packets} lidar and {result.position_packets} position packets, "

@@ -17,6 +17,7 @@ from flightlog.constants import NS_PER_MS, NS_PER_US
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame
 from flightlog.vehicles import Address, Sender, Vehicles
+from groundproc.flight.sound import possible
 from groundproc.flight.sync import GyroTrack
 
 Array = npt.NDArray[np.float64]
@@ -69,6 +70,8 @@ class Boot:
         What receive times are: "link", or "gps" where UTC of the GPS module stands in their place.
     origins : dict of str to str
         Where tables come from that are not of the link: those of the board's own log.
+    left_out : dict of str to int
+        Messages with values that cannot be, by name; see `sound`.
     """
 
     number: int
@@ -79,6 +82,7 @@ class Boot:
     heard: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None = None
     heard_by: str = "link"
     origins: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def has(self, name: str, least: int = 2) -> bool:
         """Whether there are at least so many messages of a kind."""
@@ -239,15 +243,20 @@ def _running_clock_ms(mine: Sequence[Frame]) -> npt.NDArray[np.int64]:
 def _boot(number: int, address: tuple[int, int], mine: Sequence[Frame], clock_ms: npt.NDArray[np.int64]) -> Boot:
     ids = np.fromiter((f.message_id for f in mine), np.int64, len(mine))
     tables, stamps = {}, {}
+    left_out: dict[str, int] = {}
     for name in _TABLES:
         rows = np.flatnonzero(ids == mavlink.message_id(name))
         if len(rows) == 0:
             continue
         table = mavlink.table([mine[i] for i in rows.tolist()], name)
+        good = possible(table, name)
+        if not good.all():
+            left_out[name] = int((~good).sum())
+            table, rows = table[good], rows[good]
         stamp_ns = _stamps_ns(table, clock_ms[rows])
         keep = increasing(stamp_ns)
         tables[name], stamps[name] = table[keep], stamp_ns[keep]
-    return Boot(number, *address, tables, stamps)
+    return Boot(number, *address, tables, stamps, left_out=left_out)
 
 
 def _stamps_ns(table: npt.NDArray[np.void], clock_ms: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -17,6 +17,7 @@ from flightlog.dataflash import Dataflash, Parser
 from flightlog.logfile import Message
 from groundproc.flight.autopilot import HALF_MS_NS, Boot, increasing
 from groundproc.flight.positions.scales import EPOCH_NS, WEEK_NS, utc_from_gps_calendar
+from groundproc.flight.sound import possible
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -111,6 +112,7 @@ def boot_of(log: Dataflash, number: int = 0) -> tuple[Boot | None, int]:
         _add_rates(found)
     tables = {name: _table(columns) for name, (_, _, columns) in found.items()}
     stamps = {name: stamp_ns for name, (_, stamp_ns, _) in found.items()}
+    left_out = _judged(tables, stamps)
     origins = {name: f"dataflash {source}" for name, (source, _, _) in found.items()}
     first_ns = min(int(stamp_ns[0]) for stamp_ns in stamps.values())
     for name in KEPT:
@@ -118,7 +120,18 @@ def boot_of(log: Dataflash, number: int = 0) -> tuple[Boot | None, int]:
             tables[name] = log.tables[name]
             own = _stamps_ns(log, name)
             stamps[name] = np.full(len(tables[name]), first_ns) if own is None else own
-    return Boot(number, _system(log), 1, tables, stamps, _heard(stamps, tables), "gps", origins), not_finite
+    return Boot(number, _system(log), 1, tables, stamps, _heard(stamps, tables), "gps", origins, left_out), not_finite
+
+
+def _judged(tables: dict[str, npt.NDArray[np.void]], stamps: dict[str, Times]) -> dict[str, int]:
+    """Leave out rows with values that cannot be; how many, by table."""
+    left_out = {}
+    for name, table in tables.items():
+        good = possible(table, name)
+        if not good.all():
+            left_out[name] = int((~good).sum())
+            tables[name], stamps[name] = table[good], stamps[name][good]
+    return left_out
 
 
 def _converted(log: Dataflash) -> Iterator[tuple[str, str, Times, dict[str, Array]]]:

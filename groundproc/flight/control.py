@@ -16,6 +16,8 @@ Array = npt.NDArray[np.float64]
 COLUMNS: Final = ("x", "y", "z", "sigma")
 NORMAL: Final = ("nx", "ny", "nz")
 USES: Final = {"": False, "control": False, "check": True}
+_FARTHEST_M: Final = 1e8
+_LARGEST_M: Final = 1e6
 RIM: Final = 4
 """A plane is held at its middle and at so many places around."""
 
@@ -98,7 +100,7 @@ def _point(words: dict[str, str], place: str, number: int) -> ControlPoint:
         x, y, z, sigma = (float(words[name]) for name in COLUMNS)
     except (KeyError, ValueError):
         x = y = z = sigma = np.nan
-    if not np.isfinite([x, y, z, sigma]).all() or sigma <= 0:
+    if not (all(abs(value) <= _FARTHEST_M for value in (x, y, z)) and 0.0 < sigma <= _LARGEST_M):
         raise CaptureError(f"{place}, expected x, y, z and a sigma above 0")
     use = words.get("use", "").lower()
     if use not in USES:
@@ -112,7 +114,7 @@ def _point(words: dict[str, str], place: str, number: int) -> ControlPoint:
     except (KeyError, ValueError):
         normal, radius = np.zeros(3), -1.0
     length = float(np.linalg.norm(normal))
-    if not 1e-6 < length < np.inf or not 0.0 <= radius < np.inf:
+    if not 1e-6 < length < np.inf or not 0.0 <= radius <= _LARGEST_M:
         raise CaptureError(f"{place}, expected nx, ny, nz across the plane and a radius of 0 or more")
     return replace(point, normal=normal / length, radius_m=radius)
 

@@ -1,7 +1,8 @@
 """Step clocks: read the logs but for the points, and put lidar and autopilot on one time scale."""
 
 import json
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,11 +62,20 @@ def work(run: Run, folders: Folders) -> None:
             "board_logs": flight.board_logs,
             "board_log_bad_bytes": flight.board_bad_bytes,
             "board_log_not_finite": flight.board_not_finite,
+            "impossible": left_out(flight.boots),
         },
     }
     path = folders[WHOLE] / FOUND
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def left_out(boots: Sequence[Boot]) -> dict[str, int]:
+    """Messages with values that cannot be, by name."""
+    found: Counter[str] = Counter()
+    for boot in boots:
+        found.update(boot.left_out)
+    return dict(sorted(found.items()))
 
 
 def describe_log(reader: LogReader) -> dict[str, Any]:

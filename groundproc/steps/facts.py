@@ -6,6 +6,7 @@ from pathlib import Path
 
 from flightlog.clock import utc_text
 from flightlog.errors import LogError, SwathError
+from flightlog.words import clean
 from groundproc import geodesy
 from groundproc.estimation import ins
 from groundproc.estimation.method import Given, Progress, gather
@@ -31,7 +32,7 @@ def facts(logs: Sequence[Path], progress: Progress) -> tuple[Survey, Notes, str]
         given = gather(run.readers, run.flight, run.timeline, mount, run.survey, source)
         leg = max(given.timeline, key=lambda leg: leg.sync.samples)
         head = (
-            f"survey of {', '.join(str(reader.path) for reader in run.readers)}\n"
+            f"survey of {', '.join(clean(str(reader.path)) for reader in run.readers)}\n"
             f"{utc_text(run.readers[0].start_ns)} to {utc_text(run.readers[-1].end_ns)}\n"
             "every option is at its default but for what this flight tells; see docs/survey.md\n"
         )

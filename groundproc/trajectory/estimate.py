@@ -14,7 +14,6 @@ docs/estimate.md describes each file.
 
 import hashlib
 import json
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +24,7 @@ import numpy.typing as npt
 from flightlog import config
 from flightlog.errors import LogError
 from flightlog.mount import Mount, load_mount
+from groundproc.arrays import read_arrays
 from groundproc.files import written_aside
 from groundproc.flight.timeline import ClockTie
 from groundproc.geodesy import LocalFrame
@@ -182,7 +182,7 @@ def read_estimate(folder: Path) -> Estimate:
         said.mount_sigma,
         said.report,
         said.warning,
-        _read_arrays(folder / FIGURES),
+        read_arrays(folder / FIGURES),
         method=said.method,
         note="; ".join(filter(None, (said.note, CHANGED if changed else ""))),
     )
@@ -224,7 +224,7 @@ def _exact(trajectory: Trajectory, digest: str) -> dict[str, npt.NDArray[Any]]:
 def _read_trajectory(folder: Path) -> tuple[Trajectory, bool]:
     """The trajectory, and whether trajectory.csv was changed since it was written."""
     path = folder / EXACT
-    held = _read_arrays(path)
+    held = read_arrays(path)
     needed = (*_OF_TRAJECTORY, "frame", "interpolation", "csv_sha256")
     _check(path, all(name in held for name in needed), f"the arrays {', '.join(needed)}")
     rows = len(np.atleast_1d(held["time_ns"]))
@@ -246,7 +246,7 @@ def _read_trajectory(folder: Path) -> tuple[Trajectory, bool]:
 
 
 def _read_correlation(path: Path) -> Correlation:
-    held = _read_arrays(path)
+    held = read_arrays(path)
     _check(path, "time_ns" in held and "covariance" in held, "the arrays time_ns and covariance")
     time_ns, covariance = held["time_ns"], held["covariance"]
     _check(path, time_ns.ndim == 1 and time_ns.dtype == np.int64 and len(time_ns) > 0, "times as whole numbers")
@@ -288,13 +288,3 @@ def _write_text(path: Path, text: str) -> None:
 def _write_arrays(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> None:
     with written_aside(path) as aside, aside.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-
-
-def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as held:
-            return {name: held[name] for name in held.files}
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (ValueError, EOFError, KeyError, AttributeError, TypeError, zipfile.BadZipFile):
-        raise LogError(f"{path}: is no file of arrays (npz)") from None

@@ -225,7 +225,7 @@ def test_the_report_accounts_for_every_shot(flown: Processed) -> None:
     }  # fmt: skip
     assert quality["points"]["written"] == flown.cloud.header.point_count
     dropped = quality["points"]["shots_dropped"]
-    assert set(dropped) == {"no_pose", "outside_fov", "no_return", "out_of_range"}
+    assert set(dropped) == {"no_pose", "outside_fov", "no_return", "out_of_range", "impossible"}
     assert quality["lidar"]["packets"] * 384 == quality["points"]["written"] + sum(dropped.values())
     # the window of 210 deg: five twelfths of the circle are left out, airframe and all
     assert dropped["outside_fov"] / (quality["lidar"]["packets"] * 384) == pytest.approx(150 / 360, abs=0.02)

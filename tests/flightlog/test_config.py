@@ -212,3 +212,10 @@ def test_a_file_that_no_configuration_is_and_a_name_that_none_can_have(tmp_path:
         config.load(path, Recorder)
     with pytest.raises(ConfigError, match="is no name of a file"):
         config.load("a\0b", Recorder)
+
+
+@pytest.mark.parametrize("text", ["rate_hz: " + "9" * 400, "rate_hz: .inf", "rate_hz: .nan"])
+def test_numbers_beyond_any_float_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config.loads(text, Recorder, "text")
+    assert len(str(error.value)) < 300

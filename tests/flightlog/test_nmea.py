@@ -167,3 +167,12 @@ def test_what_is_written_reads_back(second: int, latitude_deg: float, longitude_
 
 def test_the_checksum_is_the_one_of_a_recorded_sentence() -> None:
     assert checksum(MONTEREY[1:].split("*")[0]) == 0x09
+
+
+@pytest.mark.parametrize("place", [3, 5, 7, 8])
+@pytest.mark.parametrize("wrong", ["nan", "inf", "1e300", "99999.0", "00nan", "000nan"])
+def test_a_sentence_with_a_number_that_cannot_be_is_none(place: int, wrong: str) -> None:
+    words = ["GPRMC", "100000.00", "A", "5823.64", "N", "01534.44", "E", "0.1", "84.4", "010524", "", "", "A"]
+    assert parse_rmc("$" + ",".join(words)) is not None
+    words[place] = wrong
+    assert parse_rmc("$" + ",".join(words)) is None

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flightlog.words import clean, clean_bytes, clean_lines
+from flightlog.words import clean, clean_bytes, clean_lines, clean_output
 
 
 @pytest.mark.parametrize(
@@ -46,3 +46,9 @@ def test_length_is_bounded() -> None:
     assert len(clean("x" * 10_000)) < 2010
     assert clean("x" * 30, most=10) == "x" * 10 + "..."
     assert clean_lines("a\nb\x1b\nc", most=2) == [r"b\x1b", "c"]
+
+
+def test_output_keeps_its_lines_and_nothing_else_that_acts() -> None:
+    text = "a\tb\nprogress\rdone\x1b[2J\x07\u202e \u00e5"
+    assert clean_output(text) == "a\tb\nprogress\rdone\\x1b[2J\\x07\\u202e \u00e5"
+    assert clean_output("x" * 100_000) == "x" * 100_000

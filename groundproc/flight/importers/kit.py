@@ -35,6 +35,9 @@ Times = npt.NDArray[np.int64]
 _TOPIC: Final = records.MAVLINK.topic + "ins"
 _BATCH_NS: Final = 100 * NS_PER_MS
 _UNKNOWN: Final = 65_535
+DAY_NS: Final = 86_400 * NS_PER_S
+_LONGEST_NS: Final = 10 * DAY_NS
+"""Of a flight's files; time since the first of them is counted in 32 bits of milliseconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,11 @@ def import_kit(
 
 
 def _check_overlap(times: dict[Path, Times]) -> None:
+    for path, t in times.items():
+        if int(t[-1]) - int(t[0]) > _LONGEST_NS:
+            raise CaptureError(
+                f"{path}: {utc_text(int(t[0]))} to {utc_text(int(t[-1]))} is no flight, expected {_LONGEST_NS // DAY_NS} days at most"
+            )
     (first, span), *others = ((path, (int(t[0]), int(t[-1]))) for path, t in times.items())
     for path, (begin, end) in others:
         if min(end, span[1]) - max(begin, span[0]) < 2 * NS_PER_S:
@@ -141,7 +149,9 @@ def _imu(time_ns: Times, rate: Array, force: Array, start_ns: int) -> Iterator[t
 def _fixes(solution: Solution, start_ns: int) -> Iterator[tuple[int, Any]]:
     """GPS_RAW_INT of every position, with its own accuracy; a height above the ellipsoid is said to be one."""
     sigma = np.sqrt(np.diagonal(solution.covariance_m2, axis1=1, axis2=2))
-    undulation = np.zeros(len(sigma)) if solution.undulation_m is None else solution.undulation_m
+    undulation = (
+        np.zeros(len(sigma)) if solution.undulation_m is None else np.nan_to_num(solution.undulation_m, nan=0.0)
+    )
     above_sea = solution.height_m - (undulation if solution.height_reference == ELLIPSOID else 0.0)
     for i, now_ns in enumerate(solution.time_ns.tolist()):
         horizontal, vertical = (

@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 from flightlog.errors import LogError
 from flightlog.records import line_dtype
+from groundproc.arrays import read_arrays
+from groundproc.flight.sound import FORCE_M_S2, RATE_RAD_S
 from groundproc.text import decimal_comma, open_text, table_of
 
 Array = npt.NDArray[np.float64]
@@ -18,6 +20,7 @@ SCAN_COLUMNS: Final = ("time_ns", "angle_deg", "range_m", "intensity")
 IMU_COLUMNS: Final = (
     "time_ns", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2",
 )  # fmt: skip
+_LARGEST: Final = np.repeat([RATE_RAD_S, FORCE_M_S2], 3)
 _UNEVEN_RAD: Final = np.deg2rad(0.02)
 """Angles of a line may be off an even spacing by this: they are stated to 0.01 deg."""
 _DEFAULT_LINE_S: Final = 1.0 / 18.0
@@ -37,7 +40,7 @@ def read_lines(path: Path) -> npt.NDArray[np.void]:
     """
     try:
         tables = _npz(path) if path.suffix.lower() == ".npz" else _csv(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, OverflowError) as error:
         raise LogError(
             f"{path}: cannot be read as lines of a scanner ({error}); expected {', '.join(SCAN_COLUMNS)}"
         ) from None
@@ -65,9 +68,13 @@ def read_lines(path: Path) -> npt.NDArray[np.void]:
 
 
 def _npz(path: Path) -> tuple[Times, Array, Array, Array, float]:
-    with np.load(path, allow_pickle=False) as found:
-        step = float(found["shot_step_s"]) if "shot_step_s" in found else 0.0
-        time_ns, angle, ranges, intensity = (np.asarray(found[name]) for name in SCAN_COLUMNS)
+    found = read_arrays(path)
+    step = float(found["shot_step_s"]) if "shot_step_s" in found else 0.0
+    time_ns, angle, ranges, intensity = (found[name] for name in SCAN_COLUMNS)
+    if (time_ns.ndim, angle.ndim) != (1, 1) or any(
+        array.dtype.kind not in "iuf" for array in (time_ns, angle, ranges, intensity)
+    ):
+        raise ValueError("arrays of other shapes or kinds")
     return time_ns.astype(np.int64), angle, ranges, intensity, step
 
 
@@ -96,14 +103,14 @@ def read_imu(path: Path) -> tuple[Times, Array, Array]:
         columns = _columns(path, IMU_COLUMNS, "an IMU's samples have")
         values = np.stack([column.astype(np.float64) for column in columns[1:]], axis=1)
         time_ns = columns[0].astype(np.int64)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, OverflowError) as error:
         raise LogError(
             f"{path}: cannot be read as an IMU's samples ({error}); expected {', '.join(IMU_COLUMNS)}"
         ) from None
     if len(time_ns) < 2 or (np.diff(time_ns) <= 0).any():
         raise LogError(f"{path}: {len(time_ns)} samples, expected at least 2, of growing times")
-    if not np.isfinite(values).all():
-        raise LogError(f"{path}: a sample is not a number")
+    if not (np.abs(values) <= _LARGEST).all():
+        raise LogError(f"{path}: a sample is no number, or above {RATE_RAD_S:g} rad/s or {FORCE_M_S2:g} m/s^2")
     return time_ns, values[:, :3], values[:, 3:]
 
 
@@ -119,9 +126,8 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> list[npt.NDArray[
         for _, words in found.of([first]):  # of the first row only: there may be millions
             if comma := decimal_comma(words):
                 raise ValueError(comma)
-        values = np.loadtxt(
-            chain([first], file), delimiter=found.separator, dtype=np.str_, ndmin=2, usecols=places, quotechar='"'
-        )
+        rows = (line for line in chain([first], file) if line.strip())
+        values = np.loadtxt(rows, delimiter=found.separator, dtype=np.str_, ndmin=2, usecols=places, quotechar='"')
     if not len(values):
         raise ValueError("no rows")
     return list(values.T)

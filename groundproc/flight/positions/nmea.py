@@ -31,6 +31,7 @@ _CLOCK: Final = re.compile(r"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9]|60)(\.[0-
 _DAY_NS: Final = 86_400 * NS_PER_S
 _KNOT_M_S: Final = 1852 / 3600
 _LONGEST_LINE: Final = 1 << 16
+_LARGEST: Final = 1e9
 
 _GGA_QUALITY: Final = {
     1: Quality.SINGLE, 2: Quality.DGPS, 3: Quality.SINGLE, 4: Quality.FIX, 5: Quality.FLOAT, 6: Quality.DEAD_RECKONING,
@@ -63,6 +64,13 @@ class _Epoch:
     """Variances east, north, up and covariance east-north."""
     velocity: tuple[float, float] | None = None
     """East, north."""
+
+    def say(self, words: list[str], quality: Quality, undulation_m: float, age_s: float) -> None:
+        """Take a position of GGA or GNS, all of it or, where a word is no number, nothing."""
+        place = (_angle(words[2], words[3], "N", "S"), _angle(words[4], words[5], "E", "W"), _value(words[9]))
+        satellites, hdop = _value(words[7] or "0"), _optional(words[8])
+        self.place, self.quality, self.satellites, self.hdop = place, quality, satellites, hdop
+        self.undulation_m, self.age_s = undulation_m, age_s
 
 
 @dataclass(slots=True)
@@ -155,15 +163,23 @@ def _angle(text: str, letter: str, positive: str, negative: str) -> float:
     """Degrees of ddmm.mmm and a letter."""
     if letter not in (positive, negative):
         raise ValueError
-    value = float(text)
+    value = _value(text)
     degrees, minutes = divmod(value, 100.0)
     if value < 0 or minutes >= 60.0:
         raise ValueError
     return (degrees + minutes / 60.0) * (1 if letter == positive else -1)
 
 
+def _value(text: str) -> float:
+    """A number that can be one of a receiver's."""
+    value = float(text)
+    if not abs(value) <= _LARGEST:
+        raise ValueError
+    return value
+
+
 def _optional(text: str) -> float:
-    return float(text) if text else math.nan
+    return _value(text) if text else math.nan
 
 
 def _gga(reader: _Reader, words: list[str]) -> None:
@@ -176,9 +192,7 @@ def _gga(reader: _Reader, words: list[str]) -> None:
         return
     if words[10] not in ("M", "") or words[12] not in ("M", ""):
         raise ValueError
-    epoch.place = (_angle(words[2], words[3], "N", "S"), _angle(words[4], words[5], "E", "W"), float(words[9]))
-    epoch.quality, epoch.satellites, epoch.hdop = quality, float(words[7] or 0), _optional(words[8])
-    epoch.undulation_m, epoch.age_s = _optional(words[11]), _optional(words[13])
+    epoch.say(words, quality, _optional(words[11]), _optional(words[13]))
 
 
 def _gns(reader: _Reader, words: list[str]) -> None:
@@ -191,9 +205,9 @@ def _gns(reader: _Reader, words: list[str]) -> None:
     if not kinds:
         reader.left_out["without_fix"] = reader.left_out.get("without_fix", 0) + 1
         return
-    epoch.place = (_angle(words[2], words[3], "N", "S"), _angle(words[4], words[5], "E", "W"), float(words[9]))
+    epoch.place = (_angle(words[2], words[3], "N", "S"), _angle(words[4], words[5], "E", "W"), _value(words[9]))
     # each system has a letter; what the best of them reaches is what the position has
-    epoch.quality, epoch.satellites, epoch.hdop = min(kinds), float(words[7] or 0), _optional(words[8])
+    epoch.quality, epoch.satellites, epoch.hdop = min(kinds), _value(words[7] or "0"), _optional(words[8])
     epoch.undulation_m, epoch.age_s = _optional(words[10]), _optional(words[11])
 
 
@@ -219,13 +233,13 @@ def _rmc(reader: _Reader, words: list[str]) -> None:
         year = int(date[4:])
         epoch.date_ns = _midnight_ns(year + (1900 if year >= 80 else 2000), int(date[2:4]), int(date[:2]))
     if words[2] == "A" and words[7] and words[8]:
-        epoch.velocity = _course(float(words[7]), float(words[8]))
+        epoch.velocity = _course(_value(words[7]), _value(words[8]))
 
 
 def _vtg(reader: _Reader, words: list[str]) -> None:
     # it has no time of its own: it belongs to the epoch it stands in
     if reader.epochs and words[1] and words[5]:
-        reader.epochs[-1].velocity = _course(float(words[5]), float(words[1]))
+        reader.epochs[-1].velocity = _course(_value(words[5]), _value(words[1]))
 
 
 def _course(speed_knots: float, course_deg: float) -> tuple[float, float]:

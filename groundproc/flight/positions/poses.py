@@ -19,6 +19,7 @@ _CROSS: Final = {
 _CROSS_ATTITUDE: Final = {
     "covariance_roll_pitch_deg2": (0, 1), "covariance_pitch_heading_deg2": (1, 2), "covariance_roll_heading_deg2": (0, 2),
 }  # fmt: skip
+_LARGEST: Final = 1e12
 _DEG2: Final = np.deg2rad(1.0) ** 2
 
 
@@ -88,6 +89,8 @@ def _extra(path: Path, names: list[str]) -> dict[str, Array]:
             except ValueError:
                 raise LogError(f"{path}: line {number}: a covariance is no number") from None
     table = np.array(rows)
+    if (np.abs(table) > _LARGEST).any():
+        raise LogError(f"{path}: a covariance of {np.nanmax(np.abs(table)):g} found, expected {_LARGEST:g} at most")
     return {name: table[:, i] for i, name in enumerate(found)}
 
 

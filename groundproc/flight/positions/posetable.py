@@ -1,5 +1,6 @@
 """The columns of trajectory.csv, ours or another program's with the same names."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -117,7 +118,8 @@ def _numbers(words: list[str], names: list[str]) -> tuple[int, list[float]] | No
         return None
     for name, value in zip(names, values, strict=True):
         # a sigma may be missing
-        if not name.startswith("sigma") and not abs(value) <= _LARGEST.get(name, 1e9):
+        stated = not (name.startswith("sigma") and math.isnan(value))
+        if stated and not abs(value) <= _LARGEST.get(name, 1e9):
             return None
     return stamp, values
 

@@ -37,6 +37,8 @@ _COLUMNS: Final = {
 }
 _WEEK_S: Final = 604_800
 _LATEST_NS: Final = 1 << 62
+_LARGEST: Final = 1e12
+"""Of a value: what RTKLIB writes when it is lost is below, and its square is a number."""
 _NEAREST_M: Final = 6.3e6
 _FARTHEST_M: Final = 6.5e6
 """From the centre of the Earth."""
@@ -227,9 +229,10 @@ def _row(line: str, header: _Header) -> tuple[int, list[float]] | None:
         else:
             time_ns, words = _week_ns(words[0], words[1]), words[2:]
         values = [float(word) for word in words]
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         return None
-    if len(values) != len(header.names) or not all(map(math.isfinite, values)) or not 0 <= time_ns < _LATEST_NS:
+    possible = all(abs(value) <= _LARGEST for value in values) and 0 <= time_ns < _LATEST_NS
+    if len(values) != len(header.names) or not possible:
         return None
     return time_ns, values
 

@@ -45,6 +45,8 @@ _LARGEST: Final = {
 """Magnitudes that values cannot exceed; angles are written within a turn."""
 _DEGREES: Final = {"latitude": 90.0, "roll": 180.0, "pitch": 90.0}
 _SPEEDS: Final = ("altitude", "x_velocity", "y_velocity", "z_velocity")
+_LARGEST_SIGMA: Final = 1e5
+"""Metres, metres a second or minutes of arc: what is larger, or no number, is not stated."""
 _MOST: Final = 0.9
 """This part of the first records must be sound for a file to be taken for an SBET."""
 _LONGEST_STEP_S: Final = 60.0
@@ -260,7 +262,8 @@ def _covariances(calendar_ns: npt.NDArray[np.int64], accuracy: Path | None, path
     time_s, stated_s = (calendar_ns - start) * 1e-9, (stated_ns - start) * 1e-9
 
     def at(*names: str) -> Array:
-        return np.stack([np.interp(time_s, stated_s, records[name]) for name in names], axis=-1)
+        columns = (np.where(np.abs(records[name]) <= _LARGEST_SIGMA, records[name], np.nan) for name in names)
+        return np.stack([np.interp(time_s, stated_s, column) for column in columns], axis=-1)
 
     angle = at("roll", "pitch", "heading") * _MINUTE_RAD
     return (

@@ -175,6 +175,7 @@ def tidied(solution: Solution, place: str) -> Solution:
             & (solution.height_m > _LOWEST_M)
             & (solution.height_m < _HIGHEST_M)
         )
+    possible &= _within(solution)
     _count(left_out, "without_fix", int((~fixed).sum()))
     _count(left_out, "impossible", int((fixed & ~possible).sum()))
     kept = solution.rows(fixed & possible)
@@ -210,6 +211,22 @@ def dated(solution: Solution, near_utc_ns: int | None) -> Solution:
     note = f"{wrong} of its dates are whole eras of 1024 GPS weeks off, from {stated} on; mended to {utc_text(int(time_ns[0]))}"
     order = np.argsort(time_ns, kind="stable")
     return dataclasses.replace(solution, time_ns=time_ns, notes=(*solution.notes, note)).rows(order)
+
+
+_LARGEST: Final = {
+    "covariance_m2": 1e12, "undulation_m": 200.0, "velocity_m_s": 1e4, "velocity_covariance_m2_s2": 1e8, "attitude_covariance_rad2": 1e6,
+}  # fmt: skip
+"""Magnitudes that cannot be exceeded by what a row says beside its place; not a number: it does not say."""
+
+
+def _within(solution: Solution) -> npt.NDArray[np.bool_]:
+    """Which rows say nothing that cannot be, shape (n,)."""
+    good = np.ones(len(solution), np.bool_)
+    for name, most in _LARGEST.items():
+        values = getattr(solution, name)
+        if values is not None:
+            good &= (~(np.abs(values) > most)).reshape(len(good), -1).all(axis=1)
+    return good
 
 
 def _count(left_out: dict[str, int], reason: str, number: int) -> None:

@@ -5,6 +5,7 @@ limited, so that it never sent it; or it was lost. The stamps say how many are m
 would have looked, and that tells the reasons apart.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -92,6 +93,8 @@ class LidarSummary:
         for name in account.__slots__:
             if not name.startswith("fov"):
                 self.totals[name] = self.totals.get(name, 0) + int(getattr(account, name))
+        if not math.isfinite(account.fov_start_deg + account.fov_end_deg):
+            return
         start, end = (round(a * 100) % AZIMUTH_STEPS for a in (account.fov_start_deg, account.fov_end_deg))
         if start != end:
             self.window = (start, end)
@@ -154,7 +157,11 @@ class LidarSummary:
         }
 
     def _mode(self) -> str | None:
-        names = [self.model.mode_names[mode] for mode, _ in sorted(self.modes.items(), key=lambda item: -item[1])]
+        known = self.model.mode_names
+        modes = sorted(self.modes, key=lambda mode: -self.modes[mode])
+        names = [known[mode] for mode in modes if mode in known]
+        if unknown := len(modes) - len(names):
+            names.append(f"{unknown} unknown")
         return " and ".join(names) if names else None
 
     def _packet_ns(self) -> int:

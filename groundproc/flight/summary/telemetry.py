@@ -4,9 +4,12 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
+import numpy as np
+
 from flightlog import clock
 from flightlog.mavlink import Frame, message_id, payload_dtype
 from flightlog.vehicles import Vehicles
+from groundproc.flight import sound
 from groundproc.flight.claims import can_be
 from groundproc.flight.summary.numbering import Numbering
 from groundproc.flight.summary.rates import rate_hz, rounded
@@ -18,6 +21,9 @@ FIX_3D: Final = 3
 """`fix_type` of GPS_RAW_INT from which on there is a position with its height."""
 _SYSTEM_TIME: Final = message_id("SYSTEM_TIME")
 _GPS_RAW_INT: Final = message_id("GPS_RAW_INT")
+_JUDGED: Final = {message_id(name): name for name in sound.LARGEST}
+_TOGETHER: Final = 500
+"""Messages whose values are looked at in one go."""
 _BOOT_TIMED: Final = tuple(message_id(name) for name in ("SYSTEM_TIME", "ATTITUDE", "GLOBAL_POSITION_INT"))
 
 
@@ -68,6 +74,9 @@ class TelemetrySummary:
     """Reports of the receiver since its first fix in three dimensions."""
     without_fix: int = 0
     """Those of them without one."""
+    impossible: dict[str, int] = field(default_factory=dict)
+    """Messages with values that cannot be, by name."""
+    _waiting: dict[int, list[bytes]] = field(default_factory=dict)
 
     def add(self, frame: Frame) -> None:
         """Take the next frame; one outside the dialect counts nothing, its sender is not proven."""
@@ -87,6 +96,8 @@ class TelemetrySummary:
                 self.fixes += 1
                 self.without_fix += fix_type < FIX_3D
             self.satellites = max(self.satellites or 0, _value(frame, "satellites_visible"))
+        if frame.message_id in _JUDGED:
+            self._judge(frame)
         if frame.message_id in _BOOT_TIMED:
             _boot(node, frame.time_ns, _value(frame, "time_boot_ms"))
         if frame.message_id == _SYSTEM_TIME:
@@ -99,8 +110,25 @@ class TelemetrySummary:
         else:
             self.impossible_utc += utc_ns >= clock.PLAUSIBLE_UTC_NS[1]
 
+    def _judge(self, frame: Frame) -> None:
+        waiting = self._waiting.setdefault(frame.message_id, [])
+        waiting.append(frame.payload)
+        if len(waiting) >= _TOGETHER:
+            self._judge_waiting()
+
+    def _judge_waiting(self) -> None:
+        """Count the messages with values that cannot be, among those not looked at yet."""
+        for number, payloads in self._waiting.items():
+            dtype, name = payload_dtype(number), _JUDGED[number]
+            packed = b"".join(payload[: dtype.itemsize].ljust(dtype.itemsize, b"\x00") for payload in payloads)
+            bad = int((~sound.possible(np.frombuffer(packed, dtype), name)).sum())
+            if bad:
+                self.impossible[name] = self.impossible.get(name, 0) + bad
+        self._waiting.clear()
+
     def result(self, bad_bytes: int, unknown: int) -> dict[str, Any]:
         """The figures; see `swath info --json`."""
+        self._judge_waiting()
         autopilots = {key: self.nodes[key] for key in self.vehicles.vehicles()}
         return {
             "frames": self.frames,
@@ -109,6 +137,7 @@ class TelemetrySummary:
             "lost_frames": sum(node.numbers.lost for node in autopilots.values()),
             "duplicate_frames": sum(node.numbers.duplicates for node in autopilots.values()),
             "late_frames": sum(node.numbers.late for node in autopilots.values()),
+            "impossible": dict(sorted(self.impossible.items())),
             "autopilots": [_autopilot(key, node) for key, node in autopilots.items()],
             "reboots": sum(max(len(node.boots) - 1, 0) for node in autopilots.values()),
             "gps_fix_type": self.fix_type,

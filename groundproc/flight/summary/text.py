@@ -2,9 +2,12 @@
 
 import json
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 from flightlog.words import clean
+
+_LONGEST: Final = 300
+"""Characters of a value: names of topics and attachments are the file's own words."""
 
 
 def as_text(summary: dict[str, Any]) -> str:
@@ -44,7 +47,7 @@ def _dataflash(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _section(title: str, rows: Iterator[tuple[str, str]]) -> list[str]:
-    return ["", title, *(f"  {name:<22}{text}" for name, text in rows)]
+    return ["", clean(title), *(f"  {clean(name):<22}{clean(text, _LONGEST)}" for name, text in rows)]
 
 
 def _size(count: int) -> str:
@@ -166,12 +169,20 @@ def _position(position: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "lidar clock", position["clock_state"] + lag
 
 
-def _mavlink(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    yield "frames", f"{mavlink['frames']}, {mavlink['unknown_frames']} of unknown kind"
+def _not_as_sent(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """What of the telemetry came twice, late or damaged."""
     for key, what in (("duplicate_frames", "there twice"), ("late_frames", "out of order")):
         if mavlink[key]:
             yield "", f"{mavlink[key]} {what}"
     yield "bad bytes", str(mavlink["bad_bytes"])
+    if mavlink["impossible"]:
+        counts = ", ".join(f"{count} {name}" for name, count in mavlink["impossible"].items())
+        yield "left out", f"{counts}: values that cannot be"
+
+
+def _mavlink(mavlink: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "frames", f"{mavlink['frames']}, {mavlink['unknown_frames']} of unknown kind"
+    yield from _not_as_sent(mavlink)
     for autopilot in mavlink["autopilots"]:
         name = f"autopilot {autopilot['system']}/{autopilot['component']}"
         yield name, f"{_many(len(autopilot['boots']), 'boot')}, {autopilot['lost_frames']} frames lost on the way"

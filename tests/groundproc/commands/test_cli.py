@@ -121,3 +121,8 @@ def test_help_may_be_asked_for_by_its_name(capsys: pytest.CaptureFixture[str]) -
             main(words)
         assert caught.value.code == 0
         assert said in capsys.readouterr().out
+
+
+def test_a_word_with_a_zero_byte_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "a\0b.mcap"]) == 2
+    assert capsys.readouterr().err == "swath: 'a\\x00b.mcap' found, expected words without zero bytes\n"

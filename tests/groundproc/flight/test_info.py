@@ -268,3 +268,13 @@ def test_a_file_that_is_no_log_is_one_sentence(tmp_path: Path, capsys: pytest.Ca
     error = capsys.readouterr().err
     assert "is a packet capture" in error
     assert error.count("\n") == 1
+
+
+def test_packets_of_an_unknown_mode_and_a_window_that_is_no_number_hide_nothing(
+    tmp_path: Path, turning: Callable[..., list[tuple[int, bytes]]]
+) -> None:
+    packets = [(time_ns, payload[:1204] + b"\xee" + payload[1205:]) for time_ns, payload in turning(0.2)]
+    account = records.encode_account(START_NS, LidarAccount(fov_start_deg=float("nan"), fov_end_deg=float("inf")))
+    found = info(tmp_path / "a.mcap", [*scans(packets), (records.LIDAR_ACCOUNT.topic, START_NS, account)])
+    assert found["lidar"]["packets"] == len(packets)
+    assert found["lidar"]["return_mode"] == "1 unknown"

@@ -143,3 +143,13 @@ def test_gns_serves_where_there_is_no_gga(write: Callable[..., Path]) -> None:
 def test_a_place_that_cannot_be_is_damage(write: Callable[..., Path], place: str) -> None:
     bad = line(f"GNGGA,115942.40,{place},4,12,0.8,80.6,M,29.3,M,1.0,0000")
     assert read_nmea(write(RMC, gga("115942.20"), bad)).left_out == {"damaged": 1}
+
+
+@pytest.mark.parametrize("wrong", ["1e300", "nan", "inf", "-1e10"])
+def test_a_number_that_no_receiver_says_is_a_damaged_sentence(write: Callable[..., Path], wrong: str) -> None:
+    for bad in (gga("115943.20", height=wrong), gga("115943.20", hdop=wrong), gga("115943.20", undulation=wrong)):
+        found = read_nmea(write(gga("115942.20"), RMC, bad))
+        assert len(found) == 1
+        assert found.left_out["damaged"] == 1
+    gst = line(f"GNGST,115942.20,15,{wrong},{wrong},45.0,{wrong},0.0224,0.040")
+    assert read_nmea(write(gga("115942.20"), RMC, gst)).left_out == {"damaged": 1}

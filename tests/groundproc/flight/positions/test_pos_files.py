@@ -213,3 +213,22 @@ def test_what_is_written_is_read_again(rnx2rtkp: Callable[..., Path], write: Cal
         np.testing.assert_array_equal(getattr(again, name), getattr(plain, name), err_msg=name)
     np.testing.assert_allclose(again.covariance_m2, plain.covariance_m2, atol=1e-3, rtol=2e-2)
     assert again.base_ecef_m == pytest.approx(plain.base_ecef_m, abs=1e-3)
+
+
+@pytest.mark.parametrize("wrong", ["1e300", "1e7", "-1e200"])
+@pytest.mark.parametrize("column", range(7, 13))
+def test_a_sigma_that_cannot_be_leaves_the_row_out(write: Callable[[str], Path], column: int, wrong: str) -> None:
+    words = ROW.replace("00.2", "01.2").split()
+    words[column] = wrong
+    found = read_pos(write(HEAD + ROW + " ".join(words) + "\n"))
+    assert len(found) == 1
+    assert found.left_out == {"impossible" if wrong == "1e7" else "damaged": 1}
+
+
+@pytest.mark.parametrize(
+    "day", ["99999999999999999999/02/07", "2024/99/07", "0/0/0", "2024/02/999999999999999999999999"]
+)
+def test_a_day_that_no_calendar_has_is_a_damaged_row(write: Callable[[str], Path], day: str) -> None:
+    found = read_pos(write(HEAD + ROW + ROW.replace("2024/02/07", day)))
+    assert len(found) == 1
+    assert found.left_out == {"damaged": 1}

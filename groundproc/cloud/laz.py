@@ -1,0 +1,181 @@
+"""Points of a LAZ file for laspy, unpacked by another process: lazrs is native code, which aborts where a file's counts and sizes lie.
+
+That process has a limit on memory and on the processor's time. It unpacks ahead, so that reading costs no more time than in one process.
+"""
+
+import json
+import mmap
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import IO, Any, Final
+
+import lazrs
+from laspy._pointreader import IPointReader
+from laspy.errors import LaspyException
+
+from groundproc.cloud import lazworker
+from groundproc.cloud.lazworker import Task
+
+_MEMORY_BYTES: Final = 512 << 20
+_CHUNK_BYTES: Final = 64 << 20
+"""Chunks larger than this are unpacked point by point, not side by side, which takes them whole into memory."""
+_VARIABLE: Final = 0xFFFF_FFFF
+"""Points of a chunk where its size is stated with each."""
+_CHUNK_SIZE_AT: Final = 12
+"""Where the record of the packing states the points of a chunk (LASzip VLR)."""
+
+
+class Backend:
+    """What laspy takes for a library that unpacks.
+
+    Parameters
+    ----------
+    path : Path
+    most : int
+        Points that are asked for at once; always so many but at the end.
+    """
+
+    def __init__(self, path: Path, most: int) -> None:
+        self._path, self._most = path, most
+
+    def is_available(self) -> bool:
+        """It is."""
+        return True
+
+    def create_reader(self, source: Any, header: Any, decompression_selection: Any = None) -> "Unpacker":
+        """A reader of the points of a file that laspy has opened."""
+        vlr = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+        return Unpacker(self._path, source, header, vlr, self._most)
+
+
+class Unpacker(IPointReader):  # type: ignore[misc]
+    """Points from the other process, in the order of the file.
+
+    Parameters
+    ----------
+    path : Path
+    source : file object
+        laspy's, which is closed with this.
+    header : laspy.LasHeader
+    vlr : bytes
+        How the points are packed.
+    most : int
+        Points at once.
+    """
+
+    def __init__(self, path: Path, source: Any, header: Any, vlr: bytes, most: int) -> None:
+        self._source = source
+        self._point_bytes = int(header.point_format.size)
+        if (stated := int(lazrs.LazVlr(vlr).item_size())) != self._point_bytes:
+            raise LaspyException(f"points of {stated} bytes are packed, expected {self._point_bytes} by the header")
+        self._left, self._most = int(header.point_count), most
+        self._half, self._asked = 0, 0
+        half_bytes = min(self._left, most) * self._point_bytes
+        self._half_bytes = half_bytes + -half_bytes % mmap.ALLOCATIONGRANULARITY
+        chunk_points = int.from_bytes(vlr[_CHUNK_SIZE_AT : _CHUNK_SIZE_AT + 4], "little")
+        parallel = chunk_points == _VARIABLE or chunk_points * self._point_bytes <= _CHUNK_BYTES
+        shared = _shared(2 * self._half_bytes)
+        try:
+            self._memory = mmap.mmap(shared, 2 * self._half_bytes)
+            limit = _MEMORY_BYTES + 2 * self._half_bytes
+            offset = int(header.offset_to_point_data)
+            task = Task(str(path), offset, vlr.hex(), self._point_bytes, shared, self._half_bytes, limit, parallel)
+            self._child = _start(task)
+        finally:
+            os.close(shared)
+
+    @property
+    def source(self) -> Any:
+        """Laspy's file."""
+        return self._source
+
+    def read_n_points(self, n: int) -> bytearray:
+        """The next n points.
+
+        Raises
+        ------
+        LaspyException
+            They cannot be unpacked.
+        """
+        if not self._asked:
+            self._ask()
+        if n != self._asked:
+            raise LaspyException(f"{n} points are wanted, expected {self._asked}")
+        self._wait()
+        begin = self._half * self._half_bytes
+        self._half, self._left = 1 - self._half, self._left - n
+        self._ask()
+        return bytearray(memoryview(self._memory)[begin : begin + n * self._point_bytes])
+
+    def seek(self, point_index: int) -> None:
+        """Not possible: points come in their order."""
+        raise LaspyException("points can only be read in their order")
+
+    def close(self) -> None:
+        """End the other process, whatever it does, and close the file."""
+        self._child.kill()
+        self._child.communicate()
+        self._memory.close()
+        self._source.close()
+
+    def _ask(self) -> None:
+        """Let the next points be unpacked."""
+        self._asked = min(self._left, self._most)
+        if self._asked:
+            try:
+                _pipe(self._child.stdin).write(f"{self._half} {self._asked}\n")
+                _pipe(self._child.stdin).flush()
+            except BrokenPipeError:  # it is gone: `_wait` says why
+                pass
+
+    def _wait(self) -> None:
+        """Wait until the points that were asked for are there."""
+        answer = _pipe(self._child.stdout).readline()
+        if answer == "ok\n":
+            return
+        if not answer:
+            answer = _end(self._child.wait())
+        raise LaspyException(answer.strip())
+
+
+def _pipe(pipe: IO[str] | None) -> IO[str]:
+    assert pipe is not None
+    return pipe
+
+
+def _end(code: int) -> str:
+    """Why a process ended that said nothing."""
+    if code == -signal.SIGXCPU:
+        return "unpacking its points does not come to an end"
+    name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return f"unpacking its points failed with {name}"
+
+
+def _shared(size: int) -> int:
+    """A file descriptor of memory that processes can share."""
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("points")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.truncate(descriptor, size)
+    return descriptor
+
+
+def _start(task: Task) -> "subprocess.Popen[str]":
+    """Start the other process, with nothing of this one's environment but what lazrs' threads need."""
+    packages = str(Path(lazrs.__file__).parents[1])
+    return subprocess.Popen(
+        # isolated, and without the packages' start-up files: half of the time
+        [sys.executable, "-I", "-S", lazworker.__file__, packages, json.dumps(task._asdict())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        pass_fds=(task.shared,),
+        env={**os.environ, "MALLOC_ARENA_MAX": "2", "RUST_BACKTRACE": "0"},
+        text=True,
+    )
