@@ -31,8 +31,8 @@ from simulator.config import Options
 from simulator.render import Job, Simulation
 
 ROUNDS = 9
-CHUNK = 1808
-"""Packets decoded at a time by ours, a second as in the pipeline; the peer takes one at a time, as its stream interface has it."""
+CHUNK = 904
+"""Packets decoded at a time by ours, half a second as in the pipeline; the peer takes one at a time, as its stream interface has it."""
 FLIGHTS = [(scene, seed) for scene in ("village", "field", "facade") for seed in range(1, 7)]
 
 

@@ -47,7 +47,7 @@ def place(
     projection: geodesy.Projection,
     sinks: Sequence[Sink],
 ) -> Placed:
-    """Place and project all shots, and hand the points to the sinks, a second of flight at a time.
+    """Place and project all shots, and hand the points to the sinks, piece by piece.
 
     Parameters
     ----------
@@ -75,6 +75,7 @@ def place(
             project(points, projection)
             for sink in sinks:
                 sink.add(points)
+        del some, points  # the next piece takes their memory
     if not count:
         raise CoverageError(
             f"not one shot gives a point: the trajectory covers {utc_text(int(trajectory.time_ns[0]))} to "

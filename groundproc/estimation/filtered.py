@@ -179,4 +179,4 @@ def _warnings(solution: Solution) -> list[str]:
     return [f"filtered: after {solution.iterations} iterations still moving by {moving}; expected to settle"]
 
 
-METHOD: Final = Method(filtered_estimate, options=("positions",))
+METHOD: Final = Method(filtered_estimate, options=("positions", "poses"))

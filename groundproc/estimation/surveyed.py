@@ -13,27 +13,47 @@ from groundproc.estimation import ins
 from groundproc.estimation.method import Given
 from groundproc.flight.control import ControlPoint, read_control
 from groundproc.flight.positions.fixes import OutsideFixes, lever_arm, outside_fixes
+from groundproc.flight.positions.poses import FORMAT as POSES
+from groundproc.flight.positions.poses import read_poses
 from groundproc.flight.positions.reading import read_solution
-from groundproc.flight.positions.solution import ELLIPSOID, MSL, Quality
+from groundproc.flight.positions.solution import ELLIPSOID, MSL, Quality, Solution
+from groundproc.trajectory.covariance import correlation_of, scaled
+from groundproc.trajectory.estimate import COVARIANCE, read_covariance
 
 SMOOTHED_INTERVAL_S: Final = 1.0
 """Spacing at which outside solutions are taken that were smoothed with an IMU: their errors hang together for about as long."""
 
 
+REACH_NS: Final = 10**9
+"""How far beyond the first and the last covariance of a file its correlations still hold: they change slowly."""
+_LEAST_EIGENVALUE: Final = -1e-6
+"""Of a correlation matrix; further below 0 it is not one that rounding has spoilt."""
+
+
 def surveyed(given: Given) -> list[OutsideFixes]:
-    """The positions that the survey names, in the local frame.
+    """The positions and the poses that the survey names, in the local frame.
 
     Raises
     ------
     LogError, UsageError
         They cannot be read, none lies within the flight, or something about them is not known.
     """
-    survey = given.survey
-    if survey.positions is None:
-        return []
-    leg, fixes = given.placed[0], given.fixes[0]
+    return [
+        _in_frame(given, Path(place)) for place in (given.survey.positions, given.survey.poses) if place is not None
+    ]
+
+
+def _in_frame(given: Given, path: Path) -> OutsideFixes:
+    """One file's."""
+    survey, leg, fixes = given.survey, given.placed[0], given.fixes[0]
     start_ns, end_ns = leg.utc_from_boot(fixes.time_ns[[0, -1]]).tolist()
-    solution = read_solution(Path(survey.positions), near_utc_ns=start_ns, poses_height=_poses_height(survey.height))
+    if survey.poses is not None and path == Path(survey.poses):
+        solution = read_poses(path, height_reference=_poses_height(survey.height))
+    else:
+        solution = read_solution(path, near_utc_ns=start_ns, poses_height=_poses_height(survey.height))
+    beside = covariance_beside(path) if solution.format == POSES else None
+    if beside is not None:
+        solution = with_covariance(solution, beside)
     undulation_m = None
     if survey.geoid is not None:
         undulation_m = geodesy.undulation(survey.geoid, float(fixes.latitude_deg[0]), float(fixes.longitude_deg[0]))
@@ -48,14 +68,63 @@ def surveyed(given: Given) -> list[OutsideFixes]:
     )
     if not len(outside.between(start_ns, end_ns)):
         raise LogError(
-            f"{survey.positions}: no position between {utc_text(start_ns)} and {utc_text(end_ns)}, when the autopilot had its own"
+            f"{path}: no position between {utc_text(start_ns)} and {utc_text(end_ns)}, when the autopilot had its own"
         )
-    return [outside]
+    return outside
 
 
 def _poses_height(height: str) -> str:
     """Poses do not say what their heights refer to; they are taken to be those of the survey."""
     return height if height in (ELLIPSOID, MSL) else ELLIPSOID
+
+
+def covariance_beside(path: Path) -> Path | None:
+    """The covariance.npz beside a table of poses, if there is one."""
+    beside = path.parent / COVARIANCE
+    return beside if beside.is_file() else None
+
+
+def with_covariance(solution: Solution, path: Path) -> Solution:
+    """Poses with the full covariance of a covariance.npz.
+
+    Sigmas that the table states go before those of the file, as for a trajectory of ours: between the times of the file the correlations
+    are interpolated, and so are the sigmas where the table has none.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, is of other times, or its matrices are no covariances.
+    """
+    time_ns, covariance = read_covariance(path)
+    first, last = int(solution.time_ns[0]), int(solution.time_ns[-1])
+    if first < time_ns[0] - REACH_NS or last > time_ns[-1] + REACH_NS:
+        raise LogError(
+            f"{path}: covers {utc_text(int(time_ns[0]))} to {utc_text(int(time_ns[-1]))}, expected all of {solution.source} beside it, "
+            f"{utc_text(first)} to {utc_text(last)}; remove it where it belongs to other poses"
+        )
+    correlation = correlation_of(time_ns, covariance)
+    least = float(np.linalg.eigvalsh(correlation.matrix).min())
+    if not least > _LEAST_EIGENVALUE:
+        raise LogError(f"{path}: a correlation matrix with an eigenvalue of {least:.2g} found, expected none below 0")
+    with np.errstate(invalid="ignore"):
+        of_file = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    between = [np.interp(solution.time_ns - time_ns[0], time_ns - time_ns[0], column) for column in of_file.T]
+    sigma = np.where(np.isfinite(stated := _sigmas(solution)), stated, np.stack(between, axis=1))
+    found = scaled(correlation.at(solution.time_ns), sigma[:, :3], sigma[:, 3:])
+    return replace(
+        solution,
+        covariance_m2=found[:, :3, :3],
+        attitude_covariance_rad2=found[:, 3:, 3:],
+        cross_covariance_m_rad=found[:, :3, 3:],
+        sigma_source=f"{solution.source} and {path.name}",
+    )
+
+
+def _sigmas(solution: Solution) -> np.ndarray:
+    """Sigmas of east, north, up, roll, pitch and heading as the table states them, shape (n, 6)."""
+    attitude = solution.attitude_covariance_rad2
+    turns = np.full_like(solution.sigma_m, np.nan) if attitude is None else np.sqrt(np.einsum("nii->ni", attitude))
+    return np.concatenate([solution.sigma_m, turns], axis=1)
 
 
 FARTHEST_M: Final = 1000.0

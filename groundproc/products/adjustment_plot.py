@@ -1,17 +1,19 @@
 """adjustment.png: what the adjustment left over, over time, and how well it knows what it estimated."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter
-from matplotlib.transforms import Bbox
 
 from groundproc.products.product import Context
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = npt.NDArray[np.float64]
 
@@ -120,6 +122,9 @@ def title(sheet: Sheet) -> str:
 
 def draw_sheet(sheet: Sheet) -> Figure:
     """Draw the sheet."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FormatStrFormatter
+
     rows = _table(sheet)
     below = 0.1 + 0.21 * ((len(rows) + 1) // 2 + 1)  # inches of the table
     changed = 2.6 if len(sheet.moved_m) else 0.01
@@ -225,6 +230,8 @@ def _table(sheet: Sheet) -> list[tuple[list[str], bool]]:
 
 
 def _draw_table(axis: Axes, rows: list[tuple[list[str], bool]]) -> None:
+    from matplotlib.transforms import Bbox
+
     axis.set_axis_off()
     if not rows:
         return

@@ -22,4 +22,5 @@ class CloudLaz:
         self._writer.write(points)
 
     def finish(self) -> None:
-        """The file is closed with the context."""
+        """The file is closed with the context; then its buffers go too, which the products made after it may need."""
+        self._writer = None

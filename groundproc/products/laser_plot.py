@@ -1,14 +1,18 @@
 """lasers.png: corrections of the single lasers, with their sigmas."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from groundproc.products.product import Context
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = npt.NDArray[np.float64]
 
@@ -29,6 +33,8 @@ def draw_lasers(figures: Mapping[str, npt.NDArray[Any]]) -> Figure:
         lasers.range_m, range_sigma_m, range_found (bool), shape (n,); range_mean_m, shape (2,): mean offset and its sigma.
         lasers.elevation_rad and so on: the same of the elevations.
     """
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(11, 6.5), dpi=110)
     upper, lower = figure.subplots(2, 1, sharex=True)
     table_deg = np.rad2deg(figures["lasers.table_elevation_rad"])

@@ -1,13 +1,17 @@
 """trims.png: what the dynamic calibration added to the trajectory, over time."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 from groundproc.products.product import Context
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def draw(context: Context) -> None:
@@ -24,6 +28,8 @@ def draw_trims(figures: Mapping[str, npt.NDArray[Any]]) -> Figure:
     figures : mapping
         trims.time_ns; trims.yaw_rad, pitch_rad, roll_rad, altitude_m, x_m, y_m, course_rad (nan where there is none), shape (n,).
     """
+    from matplotlib.figure import Figure
+
     time_ns = figures["trims.time_ns"]
     seconds = (time_ns - time_ns[0]) * 1e-9
     yaw_deg, course_deg = np.rad2deg(figures["trims.yaw_rad"]), np.rad2deg(figures["trims.course_rad"])

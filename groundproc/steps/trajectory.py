@@ -8,7 +8,7 @@ from typing import Any, Final
 from flightlog import config
 from flightlog.errors import UsageError
 from flightlog.mount import Mount
-from groundproc.estimation import methods
+from groundproc.estimation import methods, surveyed
 from groundproc.estimation.method import chosen_corrections, gather
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.steps.place import check_place
@@ -19,7 +19,7 @@ from groundproc.survey import ClockSettings, MountSettings, PlacingSettings, Sur
 from groundproc.trajectory.estimate import FILES, TRAJECTORY, Estimate, is_estimate, read_estimate, write_estimate
 from groundproc.trajectory.table import read_trajectory
 
-NAMED: Final = ("mount", "positions", "control", "lasers", "compass", "geoid")
+NAMED: Final = ("mount", "positions", "poses", "control", "lasers", "compass", "geoid")
 """Options whose value may be the name of a file."""
 
 
@@ -45,6 +45,9 @@ def files(request: Request) -> Mapping[str, Path]:
     """Files that the settings name."""
     found = {name: Path(str(value)) for name in NAMED if (value := getattr(request.survey, name)) is not None}
     named = {name: path for name, path in found.items() if path.is_file() and found[name] != Path(ESTIMATE)}
+    for name in ("positions", "poses"):
+        if name in named and (beside := surveyed.covariance_beside(named[name])) is not None:
+            named[f"{name}: {beside.name}"] = beside
     if request.poses is None:
         return named
     folder = request.poses if request.poses.is_dir() else request.poses.parent

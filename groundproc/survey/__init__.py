@@ -65,6 +65,16 @@ class TrajectorySettings:
         absent="none",
         in_file=BESIDE,
     )
+    poses: str | None = setting(
+        None,
+        "methods adjusted and filtered: poses of images or of another program, beside positions; a table like trajectory.csv, and the "
+        "covariance.npz that lies beside it",
+        words=("--poses",),
+        metavar="CSV",
+        reads="file",
+        absent="none",
+        in_file=BESIDE,
+    )
     control: str | None = setting(
         None,
         "method adjusted: control points and planes (CSV: x, y, z, sigma; name, use, nx, ny, nz, radius) in coordinates and heights of "
@@ -175,7 +185,7 @@ class Survey(OutputSettings, PlacingSettings, TrajectorySettings, ClockSettings,
 
 SECTIONS: Final = (MountSettings, ClockSettings, TrajectorySettings, PlacingSettings, OutputSettings)
 """In the order of the flight from log to products."""
-FILES: Final = ("mount", "positions", "control", "lasers", "compass")
+FILES: Final = ("mount", "positions", "poses", "control", "lasers", "compass")
 """Options that name a file, looked for beside survey.yaml."""
 
 

@@ -29,7 +29,7 @@ from groundproc.files import written_aside
 from groundproc.flight.timeline import ClockTie
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.lasers import LaserCorrections, read_lasers, write_lasers
-from groundproc.trajectory.covariance import SIZE, STATES, Correlation, correlation_of
+from groundproc.trajectory.covariance import SIZE, STATES, correlation_of
 from groundproc.trajectory.table import read_trajectory, write_trajectory
 from groundproc.trajectory.trajectory import HOLD, SMOOTH, Trajectory
 
@@ -235,7 +235,7 @@ def _read_trajectory(folder: Path) -> tuple[Trajectory, bool]:
     _check(path, held["frame"].shape == (3,) and held["frame"].dtype == np.float64, "frame of shape (3,)")
     _check(path, str(held["interpolation"]) in (SMOOTH, HOLD), f"interpolation {SMOOTH} or {HOLD}")
     frame = LocalFrame(*(float(value) for value in held["frame"]))
-    correlation = _read_correlation(folder / COVARIANCE)
+    correlation = correlation_of(*read_covariance(folder / COVARIANCE))
     changed = _digest(folder / TRAJECTORY) != str(held["csv_sha256"])
     if changed:
         rounded = read_trajectory(folder / TRAJECTORY, frame)
@@ -245,7 +245,14 @@ def _read_trajectory(folder: Path) -> tuple[Trajectory, bool]:
     return Trajectory(frame, **arrays, interpolation=str(held["interpolation"]), correlation=correlation), False
 
 
-def _read_correlation(path: Path) -> Correlation:
+def read_covariance(path: Path) -> tuple[npt.NDArray[np.int64], Array]:
+    """Times [ns], shape (m,), and covariances, shape (m, 6, 6), of a covariance.npz; their order and units are those of `STATES`.
+
+    Raises
+    ------
+    LogError
+        It cannot be read, or holds something else.
+    """
     held = read_arrays(path)
     _check(path, "time_ns" in held and "covariance" in held, "the arrays time_ns and covariance")
     time_ns, covariance = held["time_ns"], held["covariance"]
@@ -253,7 +260,7 @@ def _read_correlation(path: Path) -> Correlation:
     _check(path, bool((np.diff(time_ns) > 0).all()), "times that increase")
     wanted = (len(time_ns), SIZE, SIZE)
     _check(path, covariance.shape == wanted and covariance.dtype.kind == "f", f"covariance of shape {wanted}")
-    return correlation_of(time_ns, covariance.astype(np.float64))
+    return time_ns, covariance.astype(np.float64)
 
 
 def _read_report(path: Path) -> _Said:

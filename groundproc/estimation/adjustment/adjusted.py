@@ -202,5 +202,5 @@ def joined_run(windows: list[Window], track: Track, motion: Motion, sources: Sou
 
 
 METHOD: Final = Method(
-    adjusted_estimate, options=("positions", "control", "causal"), finds_lasers=True, uses_points=True
+    adjusted_estimate, options=("positions", "poses", "control", "causal"), finds_lasers=True, uses_points=True
 )

@@ -110,6 +110,7 @@ def outside_track(fixes: OutsideFixes, mat_ins_lidar: Array, lidar_m: Array, utc
         fixes.quat_local_ins_wxyz if known else None,
         fixes.attitude_covariance_rad2 if known else None,
         float(np.hypot(utc.sigma_ns * 1e-9, LEAST_DELAY_SIGMA_S if utc.source == "gprmc" else BY_BOOT_SIGMA_S)),
+        fixes.cross_covariance_m_rad if known else None,
     )
 
 
@@ -151,7 +152,7 @@ class OutsidePoses(Observation):
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """Means of a second."""
         mat, turn_name = state.boresight(unknowns)
-        return outside_factors(self.given, state.path, unknowns, self.clock, self.arm, mat, turn_name)
+        return outside_factors(self.given, state.path, unknowns, self.clock, self.arm, mat, turn_name, self.name)
 
     def take(self, part: Mapping[str, Array], path: Path) -> None:
         """Delay and lever arm."""
@@ -161,12 +162,12 @@ class OutsidePoses(Observation):
     def report(self, outcome: Outcome) -> dict[str, Any]:
         """Where it came from, how much of it lies within the flight, and how well it agrees."""
         inside = within(self.given.time_ns, outcome.path)
-        off = outcome.largest("outside position_rms")
+        off = self._off(outcome)
         return {"outside": [{"source": self.given.source, "positions": int(inside.sum()), "residual_rms": off}]}
 
     def warnings(self, outcome: Outcome) -> list[str]:
         """Residuals beyond what is stated."""
-        off = outcome.largest("outside position_rms")
+        off = self._off(outcome)
         if off <= 1.0:
             return []
         sentence = (
@@ -174,6 +175,10 @@ class OutsidePoses(Observation):
             "last, expected under 1; sigmas, lever arm, heights or time scale of that file may be wrong"
         )
         return [sentence]
+
+    def _off(self, outcome: Outcome) -> float:
+        """Residuals over what is stated, of positions alone or of whole poses; the largest of all windows."""
+        return max(outcome.largest(f"{self.name} {what}_rms") for what in ("position", "pose"))
 
 
 def of_run(flown: Flown) -> list[Observation]:
@@ -194,7 +199,14 @@ def observed(given: Outside, name: str = "outside", arm_sigma_m: float = 0.0) ->
 
 
 def outside_factors(
-    given: Outside, path: Path, unknowns: Unknowns, clock: Clock, arm: Arm, mat_sensor_ins: Array, turn_name: str | None
+    given: Outside,
+    path: Path,
+    unknowns: Unknowns,
+    clock: Clock,
+    arm: Arm,
+    mat_sensor_ins: Array,
+    turn_name: str | None,
+    name: str = "outside",
 ) -> list[Factor]:
     """Rows of positions and of attitudes in means of a second; none where the path covers fewer than two.
 
@@ -209,6 +221,8 @@ def outside_factors(
         Boresight as estimated so far included.
     turn_name : str, optional
         The global that corrects the boresight.
+    name : str
+        Of the source: with it the names of the factors begin.
     """
     time_ns = clock.ours_ns(given.time_ns)
     inside = within(time_ns, path)
@@ -217,13 +231,13 @@ def outside_factors(
     stated = inside & _attitude_known(given)
     own = _Source(given, time_ns, path, unknowns, clock, arm)
     if stated.sum() < 2:
-        return [_weighed("outside position", *own.positions(inside))]
+        return [_weighed(f"{name} position", *own.positions(inside))]
     turns = own.attitudes(stated, mat_sensor_ins, turn_name)
     if given.cross_covariance is None:
-        return [_weighed("outside position", *own.positions(inside)), _weighed("outside attitude", *turns)]
-    found = [_weighed("outside pose", *_together(own.positions(stated), turns, own.crossed(stated)))]
+        return [_weighed(f"{name} position", *own.positions(inside)), _weighed(f"{name} attitude", *turns)]
+    found = [_weighed(f"{name} pose", *_together(own.positions(stated), turns, own.crossed(stated)))]
     alone = inside & ~stated
-    return [*found, _weighed("outside position", *own.positions(alone))] if alone.sum() >= 2 else found
+    return [*found, _weighed(f"{name} position", *own.positions(alone))] if alone.sum() >= 2 else found
 
 
 def _attitude_known(given: Outside) -> Mask:

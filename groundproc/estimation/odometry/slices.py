@@ -94,6 +94,7 @@ def slices(given: Given, start_ns: int, progress: Progress, apart: bool = False)
             points.append(shots.xyz_m[first:last])
             if apart:
                 lines.append(shots.laser[first:last])
+        del shots  # the next piece takes their memory, but for what the slice at the edge holds
     if times and number >= 0:
         yield _slice(number, times, points, lines)
 

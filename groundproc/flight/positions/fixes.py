@@ -48,6 +48,8 @@ class OutsideFixes:
         Of a small rotation vector in the local frame, mat_true = exp(v) mat_stated; not a number where it is not stated.
     left_out : dict
         Positions not taken, by reason; those of the reader included.
+    cross_covariance_m_rad : ndarray, shape (n, 3, 3), or None
+        Of position (rows) with that rotation vector (columns), in the local frame: the covariance of a pose is then a full 6 x 6.
     """
 
     source: str
@@ -61,6 +63,7 @@ class OutsideFixes:
     quat_local_ins_wxyz: Array | None
     attitude_covariance_rad2: Array | None
     left_out: dict[str, int]
+    cross_covariance_m_rad: Array | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -81,7 +84,7 @@ class OutsideFixes:
 
 _PER_ROW: Final = (
     "time_ns", "position_m", "covariance_m2", "quality", "velocity_m_s", "velocity_covariance_m2_s2", "quat_local_ins_wxyz",
-    "attitude_covariance_rad2",
+    "attitude_covariance_rad2", "cross_covariance_m_rad",
 )  # fmt: skip
 
 
@@ -162,6 +165,7 @@ def outside_fixes(
     height_m = _heights(chosen, height, undulation_m)
     mat_frame_place = _mat_frame_place(frame, chosen)
     velocity, attitude = chosen.velocity_m_s, chosen.quat_place_ins_wxyz
+    turns, crossed = _rotation_covariance(chosen)
     return OutsideFixes(
         source=f"{chosen.source} ({chosen.format})",
         time_ns=chosen.time_ns,
@@ -174,8 +178,9 @@ def outside_fixes(
         quat_local_ins_wxyz=None
         if attitude is None
         else frames.quat_multiply(frames.quat_from_mat(mat_frame_place), attitude),
-        attitude_covariance_rad2=_turned_if(mat_frame_place, _rotation_covariance(chosen), sigma_scale),
+        attitude_covariance_rad2=_turned_if(mat_frame_place, turns, sigma_scale),
         left_out=left_out,
+        cross_covariance_m_rad=_turned_if(mat_frame_place, crossed, sigma_scale),
     )
 
 
@@ -226,16 +231,20 @@ def _turned_if(mat: Array, covariance: Array | None, scale: float) -> Array | No
     return None if covariance is None else turned(mat, covariance) * scale**2
 
 
-def _rotation_covariance(solution: Solution) -> Array | None:
-    """Covariance of a small rotation vector in the place's axes [rad^2], shape (n, 3, 3), of that of roll, pitch, heading.
+def _rotation_covariance(solution: Solution) -> tuple[Array | None, Array | None]:
+    """Covariances of a small rotation vector in the place's axes, shape (n, 3, 3): its own [rad^2], and of the position with it [m rad].
+
+    Of those of roll, pitch and heading; None where they are not stated.
 
     A change of heading turns about down, one of pitch about the right axis before the roll, one of roll about the forward axis.
     """
     if solution.attitude_covariance_rad2 is None or solution.quat_place_ins_wxyz is None:
-        return None
+        return None, None
     heading, pitch, _ = frames.attitude_of(frames.mat_from_quat(solution.quat_place_ins_wxyz))
     zero = np.zeros_like(heading)
     forward = np.stack([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)], axis=-1)
     right = np.stack([np.cos(heading), -np.sin(heading), zero], axis=-1)
     down = np.stack([zero, zero, zero - 1.0], axis=-1)
-    return turned(np.stack([forward, right, down], axis=-1), solution.attitude_covariance_rad2)
+    axes, crossed = np.stack([forward, right, down], axis=-1), solution.cross_covariance_m_rad
+    turns = turned(axes, solution.attitude_covariance_rad2)
+    return turns, None if crossed is None else crossed @ np.swapaxes(axes, 1, 2)

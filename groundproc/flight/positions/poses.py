@@ -13,6 +13,8 @@ from groundproc.text import names_of, open_text, table_of
 
 Array = npt.NDArray[np.float64]
 
+FORMAT: Final = "poses"
+"""What a solution of such a table says of itself."""
 _CROSS: Final = {
     "covariance_east_north_m2": (0, 1), "covariance_north_up_m2": (1, 2), "covariance_east_up_m2": (0, 2),
 }  # fmt: skip
@@ -57,7 +59,7 @@ def read_poses(path: Path, *, height_reference: str = ELLIPSOID) -> Solution:
     return tidied(
         Solution(
             source=path.name,
-            format="poses",
+            format=FORMAT,
             point=INS,
             height_reference=height_reference,
             sigma_source="the file" if np.isfinite(poses.sigma_position_m).all() else "nobody",

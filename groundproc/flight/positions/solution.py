@@ -78,6 +78,8 @@ class Solution:
         Attitude: "east, north, up at the place" from ins.
     attitude_covariance_rad2 : ndarray, shape (n, 3, 3), or None
         Of roll, pitch, heading.
+    cross_covariance_m_rad : ndarray, shape (n, 3, 3), or None
+        Of east, north, up (rows) with roll, pitch, heading (columns); not a number where nobody states it.
     satellites, age_s, ratio : ndarray, shape (n,), or None
         Satellites used, age of the base's observations [s], and how much better the best ambiguities are than the second best.
     base_ecef_m : tuple of float, or None
@@ -104,6 +106,7 @@ class Solution:
     velocity_covariance_m2_s2: Array | None = None
     quat_place_ins_wxyz: Array | None = None
     attitude_covariance_rad2: Array | None = None
+    cross_covariance_m_rad: Array | None = None
     satellites: Array | None = None
     age_s: Array | None = None
     ratio: Array | None = None
@@ -151,7 +154,8 @@ class Solution:
 
 _PER_ROW: Final = (
     "time_ns", "latitude_deg", "longitude_deg", "height_m", "covariance_m2", "quality", "undulation_m", "velocity_m_s",
-    "velocity_covariance_m2_s2", "quat_place_ins_wxyz", "attitude_covariance_rad2", "satellites", "age_s", "ratio",
+    "velocity_covariance_m2_s2", "quat_place_ins_wxyz", "attitude_covariance_rad2", "cross_covariance_m_rad", "satellites", "age_s",
+    "ratio",
 )  # fmt: skip
 
 

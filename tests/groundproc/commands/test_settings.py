@@ -16,6 +16,7 @@ from groundproc.survey.setting import command_of
 TYPED = {
     "mount": (["--mount", "m.yaml"], "m.yaml"), "sync": (["--sync", "host"], "host"),
     "method": (["--method", "ins"], "ins"), "causal": (["--causal"], True), "positions": (["--positions", "a.pos"], "a.pos"),
+    "poses": (["--poses", "t.csv"], "t.csv"),
     "control": (["--control", "c.csv"], "c.csv"), "lasers": (["--lasers", "estimate"], "estimate"),
     "compass": (["--compass", "c.yaml"], "c.yaml"), "pose_grid_ms": (["--pose-grid-ms", "10ms"], 10.0),
     "fov_deg": (["--fov-deg=-105:105"], (-105.0, 105.0)), "min_range_m": (["--min-range-m", "2.5"], 2.5),

@@ -110,6 +110,7 @@ def test_best_goes_down_and_says_why(registered: Any) -> None:
     [
         ({}, ("adjusted", "filtered", "ins")),
         ({"positions": "better.pos"}, ("adjusted", "filtered")),
+        ({"poses": "trajectory.csv"}, ("adjusted", "filtered")),
         ({"control": "points.csv"}, ("adjusted",)),
         ({"causal": True}, ("adjusted",)),
         ({"lasers": ESTIMATE}, ("adjusted", "filtered", "ins")),

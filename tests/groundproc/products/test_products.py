@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from flightlog.errors import ConfigError, SourceError
 from flightlog.mount import Mount
 from groundproc import products
 from groundproc.cloud.points import Points
+from groundproc.cloud.writer import CloudWriter
 from groundproc.geodesy import LocalFrame, Projection, projected_crs
 from groundproc.products import Entry, chosen, plain
 from groundproc.products.product import Context, draw, streamed
@@ -185,6 +187,26 @@ def test_the_cloud_states_where_it_is_and_what_its_points_have(context: Context)
     assert [each.name for each in cloud.point_format.extra_dimensions] == ["range"]
 
 
+def test_the_buffers_of_the_cloud_are_gone_before_the_next_product_is_finished(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # tens of megabytes, and matplotlib would need its own beside them
+    writers: list[weakref.ref[CloudWriter]] = []
+    opened = CloudWriter.__init__
+
+    def remembered(writer: CloudWriter, *args: Any, **options: Any) -> None:
+        opened(writer, *args, **options)
+        writers.append(weakref.ref(writer))
+
+    monkeypatch.setattr(CloudWriter, "__init__", remembered)
+    with streamed(chosen(["cloud.laz"]), context) as [cloud]:
+        cloud.begin()
+        cloud.add(some())
+        assert [writer() is None for writer in writers] == [False]
+        cloud.finish()
+        assert [writer() is None for writer in writers] == [True]
+
+
 def test_pictures_of_methods_that_did_not_run_are_not_drawn(context: Context) -> None:
     draw(chosen(None), context)
     assert names(context.folder) == ["trajectory.gpkg"]
@@ -194,4 +216,12 @@ def test_the_registry_imports_no_product() -> None:
     script = "import sys, groundproc.products; print([m for m in sys.modules if m.startswith(('numpy', 'matplotlib', 'laspy'))])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert "laspy" not in done.stdout
+    assert "matplotlib" not in done.stdout
+
+
+def test_choosing_all_products_imports_nothing_that_only_drawing_needs() -> None:
+    # the trajectory is estimated between the two, and 27 MB of matplotlib would be beside it all the time
+    script = "import sys; from groundproc.products import REGISTRY, chosen; chosen(list(REGISTRY)); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "groundproc.products.adjustment_plot" in done.stdout.split()
     assert "matplotlib" not in done.stdout

@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
+from groundproc.estimation.observations.observation import Outcome
 from groundproc.estimation.observations.outside import (
     LEAST_SIGMA_M,
     LEAST_SIGMA_RAD,
@@ -223,6 +224,15 @@ def test_a_full_covariance_of_a_pose_ties_position_to_attitude(path: Path) -> No
         [lower @ each.matrix.toarray().reshape(count, 3, -1) for lower, each in zip(alone, apart, strict=True)], 1
     )
     np.testing.assert_allclose(factor.matrix.toarray().reshape(count, 6, -1), white @ plain, atol=1e-6)
+
+
+def test_each_source_reports_its_own_residuals_of_whole_poses_too(path: Path) -> None:
+    logs: list[dict[str, Any]] = [{"outside position_rms": 0.5, "outside2 pose_rms": 3.0}]
+    outcome = Outcome(path, logs, [], False)
+    first, second = observed(outside()), observed(replace(outside(), source="images"), "outside2")
+    assert [each.report(outcome)["outside"][0]["residual_rms"] for each in (first, second)] == [0.5, 3.0]
+    assert first.warnings(outcome) == []
+    assert "differs from images by 3.0 times" in second.warnings(outcome)[0]
 
 
 def test_each_source_has_a_clock_and_a_lever_arm_of_its_own(path: Path) -> None:

@@ -1,0 +1,47 @@
+"""A flight's shots come in pieces that bound the memory, however the log was cut into messages."""
+
+from collections.abc import Iterator
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flightlog import hdl32e
+from flightlog.constants import NS_PER_S
+from flightlog.logfile import LogReader
+from groundproc.field.madeup import write_flight
+from groundproc.flight.flight import read_flight
+from groundproc.flight.mounting import find_mount
+from groundproc.flight.shots import Tally, shots
+from groundproc.flight.timeline import Leg, legs
+from groundproc.sensors.shots import Gate
+
+MESSAGE_S = 0.1
+"""Of a made-up flight's log."""
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Iterator[LogReader]:
+    write_flight(tmp_path / "flight.mcap", 4.0)
+    with LogReader(tmp_path / "flight.mcap") as reader:
+        yield reader
+
+
+def timeline_of(reader: LogReader) -> list[Leg]:
+    flight = read_flight([reader], "ins", lambda done: None)
+    mount, _ = find_mount(None, [reader])
+    return list(legs(flight.runs, flight.boots, mount.mat_ins_lidar(), "auto"))
+
+
+def test_a_piece_is_half_a_second_and_no_shot_is_lost_between_two(reader: LogReader) -> None:
+    tally = Tally()
+    pieces = list(shots([reader], timeline_of(reader), Gate(), tally=tally))
+    spans_s = [float(np.ptp(piece.time_ns)) / NS_PER_S for piece in pieces]
+    assert max(spans_s) < 0.5 + MESSAGE_S
+    assert len(pieces) <= 4.0 / 0.5
+    # with one return a shot, each is a point, or is counted as none
+    gated = [sum(astuple(piece.gated)) for piece in pieces]
+    assert sum(map(len, pieces)) + sum(gated) == tally.packets * hdl32e.BLOCKS * hdl32e.LASERS
+    times = np.concatenate([piece.time_ns for piece in pieces])
+    assert (np.diff(times) > 0).all()
