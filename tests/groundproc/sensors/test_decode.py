@@ -1,11 +1,8 @@
 """Shots against velodyne-decoder on a recording, and against a plain loop written from the manual."""
 
-import itertools
-import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +10,7 @@ import pytest
 import velodyne_decoder
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from velodynes import Manual, Return, by_hand, by_velodyne_decoder, packets_of, payloads
 
 from flightlog import hdl32e, records
 from flightlog.errors import PacketError
@@ -25,6 +23,7 @@ ELEVATIONS_DEG = [
     -30.67, -9.33, -29.33, -8.00, -28.00, -6.67, -26.67, -5.33, -25.33, -4.00, -24.00, -2.67, -22.67, -1.33, -21.33, 0.00,
     -20.00, 1.33, -18.67, 2.67, -17.33, 4.00, -16.00, 5.33, -14.67, 6.67, -13.33, 8.00, -12.00, 9.33, -10.67, 10.67,
 ]  # fmt: skip
+MANUAL = Manual(ELEVATIONS_DEG, [0.0] * 32, laser_ns=1_152, firing_ns=46_080, block_ns=46_080)
 
 
 def decode(
@@ -37,64 +36,7 @@ def decode(
     return firings.decode(model.LIDAR.firing, packets, time_ns, gate, lasers or model.LIDAR.lasers)
 
 
-def payloads(capture: Path) -> list[bytes]:
-    """UDP payloads of 1206 bytes of a classic little-endian pcap."""
-    content = capture.read_bytes()
-    found, at = [], 24
-    while at < len(content):
-        (size,) = struct.unpack_from("<I", content, at + 8)
-        if size == 1206 + 42:
-            found.append(content[at + 16 + 42 : at + 16 + size])
-        at += 16 + size
-    return found
-
-
-def by_hand(
-    payload: bytes, time_ns: int, gate: Gate
-) -> list[tuple[int, float, float, float, float, int, int, int, int]]:
-    """Time, x, y, z, azimuth [0.01 deg], range [2 mm], intensity, laser and returns of one packet: a loop over the bytes."""
-    dual = payload[1204] == 0x39
-    blocks = [payload[100 * b : 100 * b + 100] for b in range(12)]
-    azimuths = [struct.unpack_from("<H", block, 2)[0] for block in blocks][:: 2 if dual else 1]
-    steps = sorted((b - a + 18_000) % 36_000 - 18_000 for a, b in itertools.pairwise(azimuths))
-    step = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) / 2
-    width_deg = (gate.fov_end_deg - gate.fov_start_deg) % 360 or 360
-    found = []
-    for firing, azimuth in enumerate(azimuths):
-        pair = blocks[2 * firing : 2 * firing + 2] if dual else [blocks[firing]]
-        for laser in range(32):
-            here = azimuth % 36_000 + step * 1.152 * laser / 46.08
-            # the strongest before the last, for two of one range
-            echoes = [struct.unpack_from("<HB", block, 4 + 3 * laser) for block in reversed(pair)]
-            if dual and echoes[0] == echoes[1]:
-                echoes = echoes[:1]
-            near, far = gate.min_range_m - 1e-9, gate.max_range_m + 1e-9
-            echoes = sorted((e for e in echoes if e[0] > 0 and near <= e[0] * 0.002 <= far), key=lambda echo: echo[0])
-            if (here / 100 - gate.fov_start_deg) % 360 > width_deg:
-                continue
-            for number, (steps_2mm, intensity) in enumerate(echoes, 1):
-                elevation, turned, reach = (
-                    math.radians(ELEVATIONS_DEG[laser]),
-                    math.radians(here / 100),
-                    steps_2mm * 0.002,
-                )
-                found.append(
-                    (
-                        time_ns + 46_080 * firing + 1_152 * laser,
-                        reach * math.cos(elevation) * math.sin(turned),
-                        reach * math.cos(elevation) * math.cos(turned),
-                        reach * math.sin(elevation),
-                        here % 36_000,
-                        steps_2mm,
-                        intensity,
-                        laser,
-                        number + 16 * len(echoes),
-                    )
-                )
-    return found
-
-
-def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
+def assert_same(shots: Shots, expected: list[Return]) -> None:
     """Whole numbers equal, coordinates to what float32 holds of them (131 m: 8 um)."""
     assert len(shots) == len(expected)
     if not expected:
@@ -112,21 +54,13 @@ def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
     assert np.abs(off).max() < 0.001  # of coordinates as float32: 2^-24 each, 1e-7 rad together
 
 
-def packets_of(content: list[bytes]) -> npt.NDArray[np.void]:
-    return np.frombuffer(b"".join(content), hdl32e.DATA_DTYPE)
-
-
 @pytest.fixture(scope="module")
 def monterey(recordings: Path) -> list[bytes]:
     return payloads(recordings / "lidar/hdl32e_monterey.pcap")
 
 
 def test_a_recording_decodes_as_velodyne_decoder_decodes_it(monterey: list[bytes]) -> None:
-    config = velodyne_decoder.Config(model=velodyne_decoder.Model.HDL32E, min_range=0.0, max_range=1000.0)
-    decoder = velodyne_decoder.StreamDecoder(config)
-    clouds = [cloud for i, payload in enumerate(monterey) if (cloud := decoder.decode(i * 553e-6, payload, True))]
-    rest = decoder.finish(True)
-    theirs = np.concatenate([cloud[1] for cloud in clouds] + ([rest[1]] if rest else []))
+    theirs = by_velodyne_decoder(monterey, velodyne_decoder.Model.HDL32E, 553e-6)
     ours = decode(packets_of(monterey), np.arange(len(monterey), dtype=np.int64) * 553_000)
     assert len(ours) == len(theirs) > 800_000
     assert (ours.intensity == theirs["intensity"]).all()
@@ -147,7 +81,7 @@ def test_a_recording_decodes_as_the_loop_by_hand_does(monterey: list[bytes]) -> 
     for payload in [*chosen, *monterey[::300]]:
         for gate in (Gate(), Gate(255.0, 105.0, 1.0, 70.0)):
             shots = decode(packets_of([payload]), np.array([7_000_000_000], np.int64), gate)
-            assert_same(shots, by_hand(payload, 7_000_000_000, gate))
+            assert_same(shots, by_hand(MANUAL, payload, 7_000_000_000, gate))
 
 
 @st.composite
@@ -181,10 +115,10 @@ GATES = st.sampled_from([
 @given(payload=turning_packet(), gate=GATES)
 def test_any_packet_decodes_as_the_loop_by_hand_does(payload: bytes, gate: Gate) -> None:
     shots = decode(packets_of([payload]), np.array([-5], np.int64), gate)
-    expected = by_hand(payload, -5, gate)
+    expected = by_hand(MANUAL, payload, -5, gate)
     near_edge = any(
-        min((row[4] / 100 - edge) % 360, (edge - row[4] / 100) % 360) < 1e-7
-        for row in by_hand(payload, -5, Gate(0, 360, gate.min_range_m, gate.max_range_m))
+        min((row.azimuth_cdeg / 100 - edge) % 360, (edge - row.azimuth_cdeg / 100) % 360) < 1e-7
+        for row in by_hand(MANUAL, payload, -5, Gate(0, 360, gate.min_range_m, gate.max_range_m))
         for edge in (gate.fov_start_deg, gate.fov_end_deg)
     )
     if near_edge and len(shots) != len(expected):  # exactly on the edge: the last bit of a float decides
