@@ -13,6 +13,7 @@ among them) and the share with its standard deviation. What is behind the surviv
 import argparse
 import json
 import math
+import os
 import random
 import re
 import subprocess
@@ -56,6 +57,7 @@ SEED: Final = 1
 EXAMPLES: Final = 20
 """That hypothesis draws where a test does not say how many: a fifth of the usual number, for each of many mutants."""
 COMPILED: Final = re.compile(r"^@njit\(.*\)\n", re.MULTILINE)
+OPTIONS: Final = ("-p", "no:xdist", "-m", "not soak")
 PATIENCE: Final = 15.0
 """A mutant that takes so many times as long as its tests do counts as endless; generous, for a machine that is busy."""
 SURVIVED: Final = 0
@@ -69,6 +71,15 @@ import sys
 from mutmut.mutation.diff_apply import get_diff_for_mutant
 for name in sys.argv[1:]:
     print(f"--- {name}", get_diff_for_mutant(name), sep="\\n")
+"""
+
+AT_IMPORT: Final = """
+import importlib, sys
+def watch(frame, event, _):
+    if event == "call" and frame.f_code.co_name.endswith("__mutmut_orig"):
+        print(frame.f_code.co_name.removesuffix("__mutmut_orig"))
+sys.setprofile(watch)
+importlib.import_module(sys.argv[1])
 """
 
 
@@ -106,6 +117,24 @@ def outcomes(folder: Path, module: str) -> dict[str, int | None]:
     return found
 
 
+def missed_at_import(folder: Path, module: str, survivors: list[str]) -> list[str]:
+    """Of the survivors those that live in a process of their own too.
+
+    Mutmut forks after the import, and what a module calls then is not called again.
+    """
+    name = module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    called = set(python(folder / "mutants", "-c", AT_IMPORT, name).split())
+    lives = []
+    for survivor in survivors:
+        if survivor.rpartition(".")[2].partition("__mutmut_")[0] in called:
+            words = [sys.executable, "-m", "pytest", "-q", "-x", *OPTIONS, *TESTS[module]]
+            mutant = os.environ | {"MUTANT_UNDER_TEST": survivor}
+            if subprocess.run(words, cwd=folder / "mutants", env=mutant, capture_output=True, check=False).returncode:
+                continue
+        lives.append(survivor)
+    return lives
+
+
 def prepare(folder: Path, module: str) -> None:
     """The repository's copy, with mutmut's settings and few examples."""
     copy(folder)
@@ -117,7 +146,7 @@ def prepare(folder: Path, module: str) -> None:
     options = {
         "source_paths": [module],
         "pytest_add_cli_args_test_selection": list(TESTS[module]),
-        "pytest_add_cli_args": ["-p", "no:xdist", "-m", "not soak"],
+        "pytest_add_cli_args": list(OPTIONS),
         "also_copy": sorted(path.name for path in folder.iterdir() if path.is_dir()),
         "timeout_multiplier": PATIENCE,
     }
@@ -142,6 +171,7 @@ def examine(module: str, sample: int, only: list[str]) -> dict[str, float]:
         if not found:
             raise SystemExit(f"{module}: no mutant was tried:\n{said[-2000:]}")
         survivors = [name for name, code in found.items() if code in (SURVIVED, NO_TESTS)]
+        survivors = missed_at_import(folder, module, survivors)
         endless = [name for name, code in found.items() if code in ENDLESS]
         print(differences(folder, survivors), "endless:", differences(folder, endless), sep="\n", flush=True)
     tried, killed = len(found), len(found) - len(survivors)

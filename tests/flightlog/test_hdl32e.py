@@ -174,9 +174,9 @@ def test_shots_are_timed_as_velodyne_decoder_times_them(monterey_data: Packets, 
 
 def test_dual_return_shares_a_firing_between_two_blocks() -> None:
     assert hdl32e.firing_index(0x39).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-    assert hdl32e.packet_ns(0x39) == 276_480
-    assert hdl32e.packet_ns(0x37) == 552_960
-    assert hdl32e.shot_offset_ns(0x37)[11, 31] == 11 * 46_080 + 31 * 1_152
+    assert repr([hdl32e.packet_ns(mode) for mode in (0x39, 0x37)]) == "[276480, 552960]", "whole nanoseconds"
+    for mode, firings in ((0x37, 11), (0x38, 11), (0x39, 5)):
+        assert hdl32e.shot_offset_ns(mode)[11, 31] == firings * 46_080 + 31 * 1_152
 
 
 def test_every_packet_of_a_vlp16_is_refused_by_name(vlp16_data: Packets) -> None:
@@ -202,6 +202,7 @@ def test_the_position_packets_of_a_vlp16_carry_no_gyros(vlp16_position: Packets)
         (manual_packet(mode=0x36), PacketError, "return mode 0x36"),
         (manual_packet(mode=0), PacketError, "return mode 0x00"),
         (manual_packet(product=0x28), WrongSensorError, "VLP-32C"),
+        (manual_packet(product=0), WrongSensorError, "0x00 is an unknown sensor"),
         (b"\xff\xdd" + manual_packet()[2:], WrongSensorError, "HDL-64E"),
         (manual_packet(product=0xA1), WrongSensorError, "VLS-128"),
         (manual_packet(product=0x77), WrongSensorError, "0x77 is an unknown sensor"),
@@ -215,6 +216,25 @@ def test_what_is_no_packet_of_an_hdl32e_is_refused_in_one_sentence(
     assert str(caught.value).startswith("port 2368: ")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_each_packet_is_told_by_itself_whatever_came_with_it() -> None:
+    upper_and_lower = bytearray(manual_packet())
+    upper_and_lower[1::200] = bytes([0xDD]) * len(upper_and_lower[1::200])
+    kinds = [manual_packet(0x37), manual_packet(0x38), manual_packet(0x39), bytes(upper_and_lower), manual_packet(0x36)]
+    packets = np.frombuffer(b"".join(kinds), hdl32e.DATA_DTYPE)
+    assert hdl32e.is_data(packets).tolist() == [True, True, True, False, False]
+    assert hdl32e.is_hdl64e(packets).tolist() == [False, False, False, True, False]
+    tags = [tag << 12 for tag in (0, 1, 2, 3)] * 3
+    many = [
+        manual_position(tags),
+        b"\x01" + manual_position(tags)[1:],
+        manual_position([0] * 12),
+        manual_position([7] * 12),
+    ]
+    positions = np.frombuffer(b"".join(many), hdl32e.POSITION_DTYPE)
+    assert hdl32e.is_position(positions).tolist() == [True, False, True, False]
+    assert hdl32e.has_imu(positions).tolist() == [True, True, False, False]
 
 
 def test_one_wrong_block_flag_among_twelve_is_enough_to_refuse() -> None:
