@@ -303,7 +303,7 @@ def _decode_dual(
                 last = block * _BLOCK_BYTES + 4 + 3 * k
                 first, second, returns = _pair(row, last, last + _BLOCK_BYTES, low, high)
                 if returns == 0:
-                    if row[last] or row[last + 1]:
+                    if _u16(row, last) or _u16(row, last + _BLOCK_BYTES):
                         beyond += 1
                     else:
                         nothing += 1

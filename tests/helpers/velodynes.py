@@ -72,7 +72,16 @@ class Return(NamedTuple):
     returns: int
 
 
-def by_hand(manual: Manual, payload: bytes, time_ns: int, gate: Gate) -> list[Return]:
+class Told(NamedTuple):
+    """What a packet holds: its returns, and why its other shots are none, as `Gated` counts them."""
+
+    returns: list[Return]
+    outside_fov: int
+    no_return: int
+    out_of_range: int
+
+
+def by_hand(manual: Manual, payload: bytes, time_ns: int, gate: Gate) -> Told:
     """The returns of one packet: a loop over its bytes, as the manuals describe them."""
     dual = payload[1204] == DUAL
     blocks = [payload[100 * b : 100 * b + 100] for b in range(12)]
@@ -80,23 +89,29 @@ def by_hand(manual: Manual, payload: bytes, time_ns: int, gate: Gate) -> list[Re
     steps = sorted((b - a + 18_000) % 36_000 - 18_000 for a, b in itertools.pairwise(azimuths))
     step = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) / 2
     width_deg = (gate.fov_end_deg - gate.fov_start_deg) % 360 or 360
-    found = []
+    found, outside, nothing, beyond = [], 0, 0, 0
     for number, azimuth in enumerate(azimuths):
         pair = blocks[2 * number : 2 * number + 2] if dual else [blocks[number]]
         for cell in range(32):
             firing, laser = divmod(cell, len(manual.elevation_deg))
             since_ns = firing * manual.firing_ns + laser * manual.laser_ns
             here = azimuth % 36_000 + step * since_ns / manual.block_ns
+            # the strongest before the last, for two of one range
+            echoes = [struct.unpack_from("<HB", block, 4 + 3 * cell) for block in reversed(pair)]
+            inside = _inside(echoes, gate)
             if (here / 100 - gate.fov_start_deg) % 360 > width_deg:
-                continue
-            shot = (time_ns + manual.block_ns * number + since_ns, here, laser)
-            found += _returns(manual, shot, _echoes(pair, cell, gate))
-    return found
+                outside += 1
+            elif not any(echo[0] for echo in echoes):
+                nothing += 1
+            elif not inside:
+                beyond += 1
+            else:
+                found += _returns(manual, (time_ns + manual.block_ns * number + since_ns, here, laser), inside)
+    return Told(found, outside, nothing, beyond)
 
 
-def _echoes(pair: Sequence[bytes], cell: int, gate: Gate) -> list[tuple[int, int]]:
-    """Range [2 mm] and intensity of each return of a cell, the nearer first; of two of one range the strongest before the last."""
-    echoes = [struct.unpack_from("<HB", block, 4 + 3 * cell) for block in reversed(pair)]
+def _inside(echoes: Sequence[tuple[int, int]], gate: Gate) -> list[tuple[int, int]]:
+    """Range [2 mm] and intensity of the returns within the gate, the nearer first; two that are equal are one."""
     if len(echoes) == 2 and echoes[0] == echoes[1]:
         echoes = echoes[:1]
     near, far = gate.min_range_m - 1e-9, gate.max_range_m + 1e-9

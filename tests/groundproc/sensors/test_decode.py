@@ -10,7 +10,7 @@ import pytest
 import velodyne_decoder
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from velodynes import Manual, Return, by_hand, by_velodyne_decoder, packets_of, payloads
+from velodynes import Manual, Told, by_hand, by_velodyne_decoder, packets_of, payloads
 
 from flightlog import hdl32e, records
 from flightlog.errors import PacketError
@@ -36,13 +36,14 @@ def decode(
     return firings.decode(model.LIDAR.firing, packets, time_ns, gate, lasers or model.LIDAR.lasers)
 
 
-def assert_same(shots: Shots, expected: list[Return]) -> None:
+def assert_same(shots: Shots, expected: Told) -> None:
     """Whole numbers equal, coordinates to what float32 holds of them (131 m: 8 um)."""
-    assert len(shots) == len(expected)
-    if not expected:
+    assert len(shots) == len(expected.returns)
+    assert (shots.gated.outside_fov, shots.gated.no_return, shots.gated.out_of_range) == expected[1:]
+    if not expected.returns:
         return
     time_ns, x, y, z, azimuth, ranges, intensity, laser, returns = (
-        np.array(column) for column in zip(*expected, strict=True)
+        np.array(column) for column in zip(*expected.returns, strict=True)
     )
     assert (shots.time_ns == time_ns).all()
     assert (shots.range_m == (ranges * 0.002).astype(np.float32)).all()
@@ -116,14 +117,15 @@ GATES = st.sampled_from([
 def test_any_packet_decodes_as_the_loop_by_hand_does(payload: bytes, gate: Gate) -> None:
     shots = decode(packets_of([payload]), np.array([-5], np.int64), gate)
     expected = by_hand(MANUAL, payload, -5, gate)
+    # exactly on the edge the last bit of a float decides; every shot of the packet is asked, those without a return too
+    everywhere = b"".join(payload[100 * b : 100 * b + 4] + 32 * b"\x64\x00\x00" for b in range(12)) + payload[1200:]
     near_edge = any(
         min((row.azimuth_cdeg / 100 - edge) % 360, (edge - row.azimuth_cdeg / 100) % 360) < 1e-7
-        for row in by_hand(MANUAL, payload, -5, Gate(0, 360, gate.min_range_m, gate.max_range_m))
+        for row in by_hand(MANUAL, everywhere, -5, Gate()).returns
         for edge in (gate.fov_start_deg, gate.fov_end_deg)
     )
-    if near_edge and len(shots) != len(expected):  # exactly on the edge: the last bit of a float decides
-        return
-    assert_same(shots, expected)
+    if not near_edge or shots.gated.outside_fov == expected.outside_fov:
+        assert_same(shots, expected)
 
 
 @settings(max_examples=100, deadline=None)

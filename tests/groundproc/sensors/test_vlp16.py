@@ -61,7 +61,7 @@ def test_a_packet_decodes_as_a_loop_written_from_the_manual_does(mode: int) -> N
         content += b"".join(struct.pack("<HB", *each) for each in zip(ranges[block], strength[block], strict=True))
     content += struct.pack("<IBB", 5, mode, 0x22)
     (shots,) = LIDAR.decode(packets_of([content]), np.array([1_000], np.int64), Gate())
-    expected = by_hand(MANUAL, content, 1_000, Gate())
+    expected = by_hand(MANUAL, content, 1_000, Gate()).returns
     assert len(expected) == 12 * 32
     assert shots.time_ns.tolist() == [each.time_ns for each in expected]
     assert shots.laser.tolist() == [each.laser for each in expected]
