@@ -76,6 +76,24 @@ def test_a_recording_decodes_as_velodyne_decoder_decodes_it(monterey: list[bytes
     assert (across <= np.deg2rad(0.011) * ours.range_m).all()
 
 
+@pytest.mark.parametrize("mode", [hdl32e.ReturnMode.STRONGEST, hdl32e.ReturnMode.LAST, hdl32e.ReturnMode.DUAL])
+def test_shots_are_timed_as_velodyne_decoder_times_them(monterey: list[bytes], mode: int) -> None:
+    # the mode byte of real packets is changed, as no dual return recording is at hand; equal azimuths per pair of blocks
+    packets = packets_of(monterey[:10]).copy()
+    packets["return_mode"] = mode
+    packets["blocks"]["returns"]["range"] = np.arange(1000, 1384).reshape(12, 32)  # no equal echoes, no empty ones
+    if mode == hdl32e.ReturnMode.DUAL:
+        packets["blocks"]["azimuth"][:, 1::2] = packets["blocks"]["azimuth"][:, ::2]
+    points = by_velodyne_decoder([packet.tobytes() for packet in packets], velodyne_decoder.Model.HDL32E, 553e-6)
+    shots = decode(packets, np.zeros(10, np.int64))
+    assert len(points) == len(shots) == 10 * 12 * 32
+    seconds = points["time"].astype(float).reshape(10, -1)
+    theirs_ns = np.sort((seconds - seconds.min(axis=1, keepdims=True)) * 1e9, axis=1)
+    ours_ns = np.sort(shots.time_ns.reshape(10, -1), axis=1)
+    # float32 seconds within a scan of 0.1 s are good to 4 ns
+    assert np.abs(theirs_ns - ours_ns).max() < 10
+
+
 def test_a_recording_decodes_as_the_loop_by_hand_does(monterey: list[bytes]) -> None:
     chosen = [p for p in monterey if any(struct.unpack_from("<H", p, 100 * b + 2)[0] == 36_000 for b in range(12))]
     assert chosen, "the recording has an azimuth of 36000"
