@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-LOGS: Final = tuple(f"tests/flightlog/test_{name}.py" for name in ("logfile", "salvage", "hostile_logs"))
+LOGS: Final = tuple(f"tests/flightlog/test_{name}.py" for name in ("walk", "container", "logfile", "salvage", "hostile_logs"))
 SYNC: Final = ("__init__", "correlation", "fit", "result", "tracks")
 SENSORS: Final = ("__init__", "blocks", "firings", "lasers", "linescan", "shots", "velodyne")
 TESTS: Final[dict[str, tuple[str, ...]]] = {
@@ -135,7 +135,7 @@ def missed_at_import(folder: Path, module: str, survivors: list[str]) -> list[st
     return lives
 
 
-def prepare(folder: Path, module: str) -> None:
+def prepare(folder: Path, module: str, chosen: str) -> None:
     """The repository's copy, with mutmut's settings and few examples."""
     copy(folder)
     source = (folder / module).read_text()
@@ -146,7 +146,7 @@ def prepare(folder: Path, module: str) -> None:
     options = {
         "source_paths": [module],
         "pytest_add_cli_args_test_selection": list(TESTS[module]),
-        "pytest_add_cli_args": list(OPTIONS),
+        "pytest_add_cli_args": [*OPTIONS, "-k", chosen],
         "also_copy": sorted(path.name for path in folder.iterdir() if path.is_dir()),
         "timeout_multiplier": PATIENCE,
     }
@@ -154,11 +154,11 @@ def prepare(folder: Path, module: str) -> None:
         file.write("\n[tool.mutmut]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in options.items()))
 
 
-def examine(module: str, sample: int, only: list[str]) -> dict[str, float]:
+def examine(module: str, sample: int, only: list[str], chosen_tests: str) -> dict[str, float]:
     """Mutate a module and test it; prints the survivors."""
     with tempfile.TemporaryDirectory(prefix="swath-mutations-") as name:
         folder = Path(name)
-        prepare(folder, module)
+        prepare(folder, module, chosen_tests)
         said = mutate(folder, "no-such-mutant")  # makes them, and sees which test reaches which
         names = sorted(outcomes(folder, module))
         if not names:
@@ -194,10 +194,11 @@ def main() -> int:
     parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {', '.join(TESTS)}; default: all")
     parser.add_argument("--sample", type=int, default=120, help="mutants of a module that are tried at most")
     parser.add_argument("--only", nargs="+", default=[], metavar="MUTANT", help="try these, by name")
+    parser.add_argument("-k", default="", metavar="TESTS", help="as of pytest: leave out the slow ones, to look first")
     arguments = parser.parse_args()
     figures = {}
     for module in arguments.modules or TESTS:
-        figures[module] = examine(module, arguments.sample, arguments.only)
+        figures[module] = examine(module, arguments.sample, arguments.only, arguments.k)
         print(f"{module}: {figures[module]}", flush=True)
     print(json.dumps(figures))
     return 0
