@@ -23,7 +23,10 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-LOGS: Final = tuple(f"tests/flightlog/test_{name}.py" for name in ("walk", "container", "logfile", "salvage", "hostile_logs"))
+LOGS: Final = tuple(
+    f"tests/flightlog/test_{name}.py" for name in ("walk", "container", "logfile", "salvage", "hostile_logs")
+)
+GYROS: Final = ("tests/groundproc/flight/test_sync.py", "tests/groundproc/flight/test_sync_parts.py")
 SYNC: Final = ("__init__", "correlation", "fit", "result", "tracks")
 SENSORS: Final = ("__init__", "blocks", "firings", "lasers", "linescan", "shots", "velodyne")
 TESTS: Final[dict[str, tuple[str, ...]]] = {
@@ -49,7 +52,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "flightlog/words.py": ("tests/flightlog/test_words.py",),
     "groundproc/field/bounded.py": ("tests/groundproc/field/test_pull_hostile.py",),
     "groundproc/field/pull.py": ("tests/groundproc/field/test_pull_hostile.py", "tests/end_to_end/test_pull.py"),
-    **{f"groundproc/flight/sync/{name}.py": ("tests/groundproc/flight/test_sync.py",) for name in SYNC},
+    **{f"groundproc/flight/sync/{name}.py": GYROS for name in SYNC},
     **{f"groundproc/sensors/{name}.py": ("tests/groundproc/sensors",) for name in SENSORS},
 }  # fmt: skip
 """The fast tests of each module."""
