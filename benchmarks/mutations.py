@@ -50,7 +50,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "onboard/recorder.py": ("tests/onboard/test_recorder.py", "tests/onboard/test_space.py", "tests/onboard/test_slow_disk.py"),
     "flightlog/vehicles.py": ("tests/flightlog/test_vehicles.py",),
     "flightlog/words.py": ("tests/flightlog/test_words.py",),
-    "groundproc/field/bounded.py": ("tests/groundproc/field/test_pull_hostile.py",),
+    "groundproc/field/bounded.py": ("tests/groundproc/field/test_bounded.py", "tests/groundproc/field/test_pull_hostile.py"),
     "groundproc/field/pull.py": ("tests/groundproc/field/test_pull_hostile.py", "tests/end_to_end/test_pull.py"),
     **{f"groundproc/flight/sync/{name}.py": GYROS for name in SYNC},
     **{f"groundproc/sensors/{name}.py": ("tests/groundproc/sensors",) for name in SENSORS},
