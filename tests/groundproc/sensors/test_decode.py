@@ -177,6 +177,41 @@ def test_an_equal_pair_is_one_return_and_the_nearer_is_return_one(data_payload: 
     assert set(rows[7:]) == {(k, 5000, 0x11) for k in range(4, 32)}
 
 
+def test_the_sweep_of_a_block_is_turned_by_sine_and_cosine() -> None:
+    """As far as a block may sweep, 2 deg."""
+    fraction, elevation = np.linspace(0.0, 1.0, 32), np.deg2rad(ELEVATIONS_DEG)
+    for step in (0.0, 8.3, 79.0, 200.0):
+        found = np.empty((2, 32))
+        firings._directions(step, fraction, np.cos(elevation)[None, :], found)
+        angle = np.deg2rad(step / 100.0 * fraction)
+        np.testing.assert_allclose(found[0], np.cos(elevation) * np.cos(angle), rtol=1e-10)
+        np.testing.assert_allclose(found[1], np.cos(elevation) * np.sin(angle), atol=1e-10)
+
+
+def test_both_ends_of_a_window_are_within_it(data_payload: Callable[..., bytes]) -> None:
+    """The blocks of 90.00 and 91.00 deg: their first lasers fire just there, the others behind."""
+    packet = packets_of([data_payload(0, range(8_600, 9_800, 100))])
+    shots = decode(packet, np.zeros(1, np.int64), Gate(90.0, 91.0))
+    assert (shots.time_ns // 46_080).tolist() == [4] * 32 + [5]
+    assert shots.laser.tolist() == [*range(32), 0]
+    assert shots.gated.outside_fov == 384 - 33
+    dual = packets_of([data_payload(0, np.repeat(range(8_600, 9_200, 100), 2).tolist(), mode=0x39)])
+    shots = decode(dual, np.zeros(1, np.int64), Gate(90.0, 91.0))
+    assert (shots.time_ns // 46_080).tolist() == [4] * 32 + [5]
+    assert shots.gated.outside_fov == 192 - 33
+
+
+def test_columns_are_as_narrow_as_the_clouds_they_fill(data_payload: Callable[..., bytes]) -> None:
+    """Enough packets for memory that is lent, and few."""
+    for count in (1, 400):
+        packets = packets_of([data_payload(0, range(0, 192, 16))] * count)
+        shots = decode(packets, np.zeros(count, np.int64))
+        assert len(shots) == 384 * count
+        names = ("time_ns", "xyz_m", "range_m", "intensity", "laser", "returns")
+        kinds = [getattr(shots, name).dtype for name in names]
+        assert kinds == [np.int64, np.float32, np.float32, np.uint8, np.uint8, np.uint8]
+
+
 def test_a_batch_is_cut_where_the_return_mode_changes(data_payload: Callable[..., bytes]) -> None:
     modes = [0x37, 0x37, 0x39, 0x39, 0x39, 0x38]
     packets = np.zeros(len(modes), records.SCAN_PACKET_DTYPE)
