@@ -76,15 +76,6 @@ for name in sys.argv[1:]:
     print(f"--- {name}", get_diff_for_mutant(name), sep="\\n")
 """
 
-AT_IMPORT: Final = """
-import importlib, sys
-def watch(frame, event, _):
-    if event == "call" and frame.f_code.co_name.endswith("__mutmut_orig"):
-        print(frame.f_code.co_name.removesuffix("__mutmut_orig"))
-sys.setprofile(watch)
-importlib.import_module(sys.argv[1])
-"""
-
 
 def copy(folder: Path) -> None:
     """What is in the repository, uncommitted changes too."""
@@ -120,22 +111,16 @@ def outcomes(folder: Path, module: str) -> dict[str, int | None]:
     return found
 
 
-def missed_at_import(folder: Path, module: str, survivors: list[str]) -> list[str]:
-    """Of the survivors those that live in a process of their own too.
+def alive(folder: Path, module: str, survivor: str) -> bool:
+    """Whether a survivor lives in a process of its own too, against all tests of the module.
 
-    Mutmut forks after the import, and what a module calls then is not called again.
+    Mutmut forks after the import, and what a module calls then is not called again; and of a fixture that several tests share it runs the
+    first test only.
     """
-    name = module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    called = set(python(folder / "mutants", "-c", AT_IMPORT, name).split())
-    lives = []
-    for survivor in survivors:
-        if survivor.rpartition(".")[2].partition("__mutmut_")[0] in called:
-            words = [sys.executable, "-m", "pytest", "-q", "-x", *OPTIONS, *TESTS[module]]
-            mutant = os.environ | {"MUTANT_UNDER_TEST": survivor}
-            if subprocess.run(words, cwd=folder / "mutants", env=mutant, capture_output=True, check=False).returncode:
-                continue
-        lives.append(survivor)
-    return lives
+    words = [sys.executable, "-m", "pytest", "-q", "-x", *OPTIONS, *TESTS[module]]
+    environment = os.environ | {"MUTANT_UNDER_TEST": survivor}
+    done = subprocess.run(words, cwd=folder / "mutants", env=environment, capture_output=True, check=False)
+    return done.returncode == 0
 
 
 def prepare(folder: Path, module: str, chosen: str) -> None:
@@ -174,7 +159,7 @@ def examine(module: str, sample: int, only: list[str], chosen_tests: str) -> dic
         if not found:
             raise SystemExit(f"{module}: no mutant was tried:\n{said[-2000:]}")
         survivors = [name for name, code in found.items() if code in (SURVIVED, NO_TESTS)]
-        survivors = missed_at_import(folder, module, survivors)
+        survivors = [name for name in survivors if alive(folder, module, name)]
         endless = [name for name, code in found.items() if code in ENDLESS]
         print(differences(folder, survivors), "endless:", differences(folder, endless), sep="\n", flush=True)
     tried, killed = len(found), len(found) - len(survivors)
