@@ -1,5 +1,6 @@
 """A child process whose words, time and files have bounds: real children."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -26,8 +27,18 @@ def test_what_a_child_says_and_how_it_ends_is_told() -> None:
 
 
 def test_a_child_hears_nothing() -> None:
-    """What speaks through it is asked for nothing, a password neither."""
-    assert shell("cat") == Done(0, b"", "")
+    """What speaks through it is asked for nothing, and given nothing that was meant for us."""
+    ours, their_end = os.pipe()
+    os.write(their_end, b"secret")
+    os.close(their_end)
+    kept = os.dup(0)
+    try:
+        os.dup2(ours, 0)
+        assert shell("cat") == Done(0, b"", "")
+    finally:
+        os.dup2(kept, 0)
+        os.close(kept)
+        os.close(ours)
 
 
 def test_bytes_that_are_no_text_do_no_harm() -> None:
