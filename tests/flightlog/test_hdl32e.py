@@ -190,10 +190,17 @@ def test_what_is_no_packet_of_an_hdl32e_is_refused_in_one_sentence(
 def test_each_packet_is_told_by_itself_whatever_came_with_it() -> None:
     upper_and_lower = bytearray(manual_packet())
     upper_and_lower[1::200] = bytes([0xDD]) * len(upper_and_lower[1::200])
-    kinds = [manual_packet(0x37), manual_packet(0x38), manual_packet(0x39), bytes(upper_and_lower), manual_packet(0x36)]
+    kinds = [
+        manual_packet(0x37),
+        manual_packet(0x38),
+        manual_packet(0x39),
+        bytes(upper_and_lower),
+        manual_packet(0x36),
+        manual_packet(flag=0),
+    ]
     packets = np.frombuffer(b"".join(kinds), hdl32e.DATA_DTYPE)
-    assert hdl32e.is_data(packets).tolist() == [True, True, True, False, False]
-    assert hdl32e.is_hdl64e(packets).tolist() == [False, False, False, True, False]
+    assert hdl32e.is_data(packets).tolist() == [True, True, True, False, False, False]
+    assert hdl32e.is_hdl64e(packets).tolist() == [False, False, False, True, False, False]
     tags = [tag << 12 for tag in (0, 1, 2, 3)] * 3
     many = [
         manual_position(tags),
