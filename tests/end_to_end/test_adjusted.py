@@ -50,11 +50,10 @@ def flight(simulated: Callable[..., Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def hovers(simulated: Callable[..., Any]) -> list[Any]:
-    """Nothing to see but a flat field, twice: what the compass and the fixes do in 15 s is luck. Every other revolution."""
+    """Nothing to see but a flat field, twice: what the compass and the fixes do in 15 s is luck."""
     from simulator.plans import plan
 
-    options = plan("hover").options
-    return [simulated(f"adjusted_hover_{seed}", "field", 15.0, options, seed=seed, every=2) for seed in (11, 12)]
+    return [simulated(f"adjusted_hover_{seed}", "field", 15.0, plan("hover").options, seed=seed) for seed in (11, 12)]
 
 
 def judged(folder: Path, survey: Survey, log: Path | None = None, *, cloud: bool = False) -> Judged:
