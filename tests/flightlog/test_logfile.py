@@ -515,8 +515,11 @@ def test_a_chunk_without_checksum_whose_records_do_not_add_up_is_damage(log_file
 
 def test_a_bag_without_chunks_is_refused_and_not_taken_for_empty(log_file: Path) -> None:
     foreign(log_file, CompressionType.NONE, chunking=False)
-    with pytest.raises(LogError, match="messages outside of chunks"):
-        LogReader(log_file)
+    whole = log_file.read_bytes()
+    for behind in (0, 30):  # whatever stands behind them
+        log_file.write_bytes(whole[: len(whole) - 37] + b"\xff" * behind)
+        with pytest.raises(LogError, match="messages outside of chunks"):
+            LogReader(log_file)
 
 
 def test_a_log_of_a_newer_format_is_refused(log_file: Path) -> None:

@@ -116,6 +116,7 @@ def test_every_index_says_what_stands_where(compression: str) -> None:
                         time_ns,
                         time_ns,
                     )
+    assert [(each.log_time, each.create_time) for each in summary.attachment_indexes] == [(0, 0)]
     (attached,), (named,) = summary.attachment_indexes, summary.metadata_indexes
     assert (places[attached.offset][0], len(places[attached.offset][1]) + 9) == (9, attached.length)
     assert (attached.name, attached.media_type, attached.data_size) == ("b.bin", "application/octet-stream", 7)
@@ -239,3 +240,19 @@ def test_a_record_is_whole_in_the_file_or_not_at_all_wherever_the_disk_fills_up(
         assert summary is not None
         assert summary.statistics is not None
         assert summary.statistics.message_count == len(found) == sum(writer.counts.values())
+
+
+def test_every_chunk_that_a_full_disk_did_not_take_is_counted() -> None:
+    disk = FullDisk(1_000)
+    writer = McapWriter(disk, "ros2", "swath-test", 20_000, "none")
+    channel = writer.add_channel("/a", "cdr", writer.add_schema("s", "ros2msg", b""), {})
+    for lost in (2, 4, 6):
+        for _ in range(2):
+            writer.add_message(channel, 1, bytes(2_000))
+        with pytest.raises(OSError, match="No space left"):
+            writer.close_chunk()
+        assert writer.lost == lost
+    disk.room += 10_000
+    writer.add_message(channel, 1, bytes(2_000))
+    writer.close_chunk()
+    assert (writer.counts, writer.lost) == ({channel: 1}, 6)
