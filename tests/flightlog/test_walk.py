@@ -1,6 +1,7 @@
 """What is found of a damaged file, place by place: how many damaged places, where, and how many bytes."""
 
 import io
+import struct
 from pathlib import Path
 
 import pytest
@@ -102,8 +103,10 @@ def test_a_record_whose_content_is_damaged_costs_that_record_alone(window: int) 
     damaged = bytearray(data)
     damaged[place + 9] ^= 0x40  # the length of its name
     (hole,) = holes(bytes(damaged))
-    assert hole.offset == place
+    assert (hole.offset, hole.size) == (place, 9 + int.from_bytes(data[place + 1 : place + 9], "little"))
     assert len(of_chunks(bytes(damaged))) == CHUNKS
+    kinds = [type(found).__name__ for found in walked(bytes(damaged))]
+    assert (kinds[:3], kinds.count("Attachment")) == (["Hole", "Metadata", "Attachment"], 1)
 
 
 def test_a_summary_that_does_not_add_up_is_not_believed_and_told_once(window: int) -> None:
@@ -126,6 +129,27 @@ def test_a_summary_without_a_checksum_is_believed() -> None:
     found = walked(stream.getvalue())
     assert not any(isinstance(each, Hole) for each in found)
     assert sum(type(each).__name__ == "Channel" for each in found) == 1
+
+
+def test_a_damaged_record_at_the_head_of_a_summary_without_checksum_costs_what_follows_it_up_to_the_next() -> None:
+    data = bytearray(log())
+    start, _, _ = struct.unpack_from("<QQI", data, len(data) - 28)
+    struct.pack_into("<I", data, len(data) - 12, 0)  # no checksum
+    data[start] = 0xFE  # an opcode that there is not
+    found = walked(bytes(data))
+    assert [hole.offset for hole in found if isinstance(hole, Hole)] == [start]
+    assert sum(type(each).__name__ == "Channel" for each in found) == 1
+    data[start + 1 : start + 9] = b"\xff" * 8  # and nobody knows where it ends
+    assert holes(bytes(data)) == [Hole(start, len(data) - 37 - start, False)]
+
+
+def test_garbage_of_any_length_ends_where_the_next_chunk_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever in a window that is, and across the end of one."""
+    monkeypatch.setattr(walk, "_WINDOW", 61)
+    data = log()
+    second = chunks(data)[1][0]
+    for size in range(1, 130):
+        assert holes(data[:second] + b"\xff" * size + data[second:])[0] == Hole(second, size, False)
 
 
 def test_records_of_the_summary_within_the_data_are_damage() -> None:

@@ -93,6 +93,12 @@ def test_lines_tell_of_themselves_before_they_are_decoded() -> None:
     assert dict(LIDAR.mode_names) == {0: "single"}
     np.testing.assert_allclose(digest.record_ns, 1e9 / 18, atol=4)  # float32 of 1/18 s
     assert digest.returns == 8
+    assert [each.dtype for each in (digest.azimuth_cdeg, digest.mode, digest.record_ns)] == [
+        np.int64,
+        np.uint8,
+        np.int64,
+    ]
+    assert LIDAR.valid(given).dtype == np.bool_
     assert LIDAR.valid(given).tolist() == [True, True]
     assert LIDAR.stamp_ns(given).tolist() == LIDAR.receive_time_ns(given).tolist() == [LINE_NS, LINE_NS + 55_555_556]
 
