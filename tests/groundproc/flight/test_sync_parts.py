@@ -228,3 +228,27 @@ def test_too_few_samples_in_common_are_counted() -> None:
         fit(lidar, ins, peak, 5.0, None)
     ins = GyroTrack("the autopilot", lidar.time_ns[::200], lidar.rate_rad_s[::200])
     assert fit(lidar, ins, peak, 5.0, None).samples == 59
+
+
+def test_of_a_pair_without_noise_everything_is_found() -> None:
+    """30 ppm, 3.3 ms beside where the correlation put it, 3 deg beside the mount, biases of degrees a second."""
+    drift, offset_ns, mount = 30e-6, 5 * S, Rotation.from_euler("Z", 3.0, degrees=True).as_matrix()
+    lidar = track(60.0, 200.0, "the lidar", start_ns=1_000 * S)
+    seconds = (lidar.time_ns[::8] - lidar.time_ns[0]) * 1e-9
+    stamps = lidar.time_ns[0] + offset_ns + np.rint(seconds * (1.0 + drift) * S).astype(np.int64)
+    ins = GyroTrack("the autopilot", stamps, lidar.rate_rad_s[::8] + np.deg2rad([3.0, -5.0, 2.0]), stamp_step_ns=1000)
+    peak = correlation.Peak(offset_ns - 3_300_000, 0.9, 0.2, 100.0, np.eye(3), (np.zeros(1), np.zeros(1)))
+    found = fit(lidar, ins, peak, 20.0, mount)
+    middle_s = (found.reference_ns - lidar.time_ns[0]) * 1e-9
+    assert middle_s == pytest.approx(30.0, abs=0.1)
+    # the filter of 20 Hz takes half a percent of rates below 3 Hz
+    assert found.offset_ns == pytest.approx(offset_ns + middle_s * drift * S, abs=100_000)
+    assert found.drift_ppm == pytest.approx(30.0, abs=3.0)
+    assert 0.0 < found.sigma_drift_ppm < 5.0
+    assert 1000 / np.sqrt(12.0) < found.sigma_offset_ns < 100_000
+    assert found.mount_angle_deg == pytest.approx(3.0, abs=0.05)
+    assert 0.0 < found.residual_rad_s < np.deg2rad(0.5)
+    assert (found.peak, found.rival, found.method, found.note) == (0.9, 0.2, "gyro", "")
+    # half a second is left out at either end of the lidar's track, whose last sample is the 12 000th
+    told_s = seconds * (1.0 + drift) + 0.0033
+    assert found.samples == np.count_nonzero((told_s > 0.5) & (told_s < 11_999 / 200.0 - 0.5))
