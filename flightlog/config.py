@@ -75,9 +75,8 @@ def option(
         The only values allowed.
     """
     metadata = {"about": about, "minimum": minimum, "maximum": maximum, "choices": choices}
-    if isinstance(default, (type, list, dict)):
-        factory = default if isinstance(default, type) else lambda: default
-        return dataclasses.field(default_factory=factory, metadata=metadata)
+    if isinstance(default, type):
+        return dataclasses.field(default_factory=default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 
 

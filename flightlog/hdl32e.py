@@ -74,7 +74,11 @@ BLOCK_DTYPE: Final = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", 
 DATA_DTYPE: Final = np.dtype(
     [("blocks", BLOCK_DTYPE, (BLOCKS,)), ("stamp_us", "<u4"), ("return_mode", "u1"), ("product", "u1")]
 )
-"""A data packet, 1206 bytes (M-A appendix E)."""
+"""A data packet, 1206 bytes (M-A appendix E).
+
+The stamp is that of the first firing: M-A says both first (p. 9) and last (appendix E); the arrival times of data against position
+packets say first [measured].
+"""
 
 POSITION_DTYPE: Final = np.dtype(
     {
@@ -116,15 +120,6 @@ def firing_index(return_mode: int) -> npt.NDArray[np.int64]:
     """Which firing of the packet each block belongs to, shape (12,); two blocks share a firing in dual return mode."""
     blocks = np.arange(BLOCKS, dtype=np.int64)
     return blocks // 2 if return_mode == ReturnMode.DUAL else blocks
-
-
-def shot_offset_ns(return_mode: int) -> npt.NDArray[np.int64]:
-    """Time of each shot after the packet's stamp [ns], shape (12, 32).
-
-    The stamp is that of the first firing: M-A says both first (p. 9) and last (appendix E); the arrival times of data against
-    position packets say first [measured].
-    """
-    return firing_index(return_mode)[:, None] * FIRING_NS + np.arange(LASERS, dtype=np.int64) * LASER_NS
 
 
 def packet_ns(return_mode: int) -> int:

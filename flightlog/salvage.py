@@ -14,7 +14,6 @@ SALVAGE: Final = "swath.salvage"
 """Metadata that marks a log which was made so."""
 _OURS: Final = frozenset(("swath.log", "swath.topics"))
 """Metadata that the writer adds by itself."""
-_FLUSH_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)

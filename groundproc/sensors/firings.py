@@ -154,7 +154,7 @@ def _azimuth_step(row: Any, stride: int, steps: Any) -> float:
             steps[j + 1] = steps[j]
             j -= 1
         steps[j + 1] = value
-    middle = steps[count // 2] if count % 2 else 0.5 * (steps[count // 2 - 1] + steps[count // 2])
+    middle = steps[count // 2]  # of eleven, or five
     return middle if 0.0 <= middle <= _LARGEST_STEP else 0.0
 
 
@@ -303,7 +303,7 @@ def _decode_dual(
                 last = block * _BLOCK_BYTES + 4 + 3 * k
                 first, second, returns = _pair(row, last, last + _BLOCK_BYTES, low, high)
                 if returns == 0:
-                    if row[last] or row[last + 1]:
+                    if _u16(row, last) or _u16(row, last + _BLOCK_BYTES):
                         beyond += 1
                     else:
                         nothing += 1

@@ -7,6 +7,7 @@ import laspy
 import numpy as np
 import pytest
 import velodyne_decoder
+from velodynes import by_velodyne_decoder
 
 from flightlog.logfile import LogReader
 from groundproc.cli import main
@@ -29,11 +30,7 @@ def test_a_recording_is_written_point_by_point_as_velodyne_decoder_reads_it(mont
     cloud = run(tmp_path / "out" / "all.laz", monterey_log, "--fov", "all")
     with LogReader(monterey_log) as reader:
         packets = [p.tobytes() for b in load.lidar_batches([reader]) for p in b.packets["data"]]
-    config = velodyne_decoder.Config(model=velodyne_decoder.Model.HDL32E, min_range=0.0, max_range=131.07 + 0.001)
-    decoder = velodyne_decoder.StreamDecoder(config)
-    parts = [part[1] for i, packet in enumerate(packets) if (part := decoder.decode(i * 553e-6, packet, True))]
-    rest = decoder.finish(True)
-    theirs = np.concatenate([*parts, rest[1]] if rest else parts)
+    theirs = by_velodyne_decoder(packets, velodyne_decoder.Model.HDL32E, 553e-6, 131.07 + 0.001)
     assert len(cloud.points) == len(theirs) > 800_000
     assert (np.asarray(cloud.intensity) == theirs["intensity"]).all()
     # their x is forward and their y left; millimetres in the file

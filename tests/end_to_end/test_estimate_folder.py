@@ -38,6 +38,11 @@ def processed(log: Path, folder: Path, *words: Any) -> Path:
     return folder
 
 
+def again(log: Path, folder: Path, trajectory: Path) -> Path:
+    """Placed with an estimate, without pictures."""
+    return processed(log, folder, "--trajectory", trajectory, "--products", "cloud.laz")
+
+
 def points(folder: Path) -> Array:
     cloud = laspy.read(folder / "cloud.laz")
     return np.stack([np.asarray(cloud.x), np.asarray(cloud.y), np.asarray(cloud.z)], axis=1)
@@ -52,13 +57,13 @@ def test_the_cloud_of_the_folder_is_the_cloud(
     flight: Any, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """To the last bit; and the folder that this makes is as good as the first."""
-    again = processed(flight.log, tmp_path / "out", "--trajectory", direct / "trajectory.csv")
+    new = again(flight.log, tmp_path / "out", direct / "trajectory.csv")
     said = capsys.readouterr().out
     assert "mount estimated by adjusted, begun from log" in said
     for name in ("cloud.laz", "trajectory.npz", "mount.yaml", "lasers.yaml", "ties.yaml"):
-        assert (again / name).read_bytes() == (direct / name).read_bytes(), name
-    assert quality(again)["trajectory"]["method"] == "adjusted"
-    assert str(direct) in quality(again)["trajectory"]["note"]
+        assert (new / name).read_bytes() == (direct / name).read_bytes(), name
+    assert quality(new)["trajectory"]["method"] == "adjusted"
+    assert str(direct) in quality(new)["trajectory"]["note"]
 
 
 def test_which_mount_was_used_and_that_it_was_estimated_is_said(direct: Path) -> None:
@@ -79,12 +84,12 @@ def test_rows_that_were_changed_are_placed_to_a_millimetre(flight: Any, direct: 
     shutil.copytree(direct, folder)
     with (folder / "trajectory.csv").open("a") as file:
         file.write("\n")
-    again = processed(flight.log, tmp_path / "out", "--trajectory", folder)
-    moved = np.linalg.norm(points(again) - points(direct), axis=1)
+    new = again(flight.log, tmp_path / "out", folder)
+    moved = np.linalg.norm(points(new) - points(direct), axis=1)
     assert np.median(moved) < 0.0005
     # 0.1 mm of the row, 5e-6 deg at 100 m, and the cloud's own millimetre in three axes
     assert moved.max() < 0.0025
-    assert "was changed" in quality(again)["trajectory"]["note"]
+    assert "was changed" in quality(new)["trajectory"]["note"]
 
 
 def test_a_trajectory_that_lies_alone_is_taken_with_the_mount_of_the_log_and_that_is_said(
@@ -92,7 +97,7 @@ def test_a_trajectory_that_lies_alone_is_taken_with_the_mount_of_the_log_and_tha
 ) -> None:
     """What the folder is for: without it points move by decimetres."""
     shutil.copy(direct / "trajectory.csv", tmp_path / "trajectory.csv")
-    alone = processed(flight.log, tmp_path / "out", "--trajectory", tmp_path / "trajectory.csv")
+    alone = again(flight.log, tmp_path / "out", tmp_path / "trajectory.csv")
     moved = np.linalg.norm(points(alone) - points(direct), axis=1)
     assert np.median(moved) > 0.02
     assert quality(alone)["mount"]["source"] == "log"
@@ -110,7 +115,7 @@ def test_clock_and_lasers_are_those_of_the_folder(flight: Any, direct: Path, tmp
     assert text.count(str(offset_ns)) == 1
     ties.write_text(text.replace(str(offset_ns), str(offset_ns + 20_000_000)))
     (folder / "lasers.yaml").write_text("range_m: [" + ", ".join(["0.3"] * 32) + "]\n")
-    late = processed(flight.log, tmp_path / "late", "--trajectory", folder)
+    late = again(flight.log, tmp_path / "late", folder)
     new_s, old_s = (np.asarray(laspy.read(each / "cloud.laz").gps_time) for each in (late, direct))
     new_s = new_s - 0.02
     # all but the shots at the ends of the trajectory are in both clouds; stamps are right to 0.1 us

@@ -219,3 +219,55 @@ def test_numbers_beyond_any_float_are_refused(text: str) -> None:
     with pytest.raises(ConfigError) as error:
         config.loads(text, Recorder, "text")
     assert len(str(error.value)) < 300
+
+
+def test_an_alias_is_refused_with_its_place() -> None:
+    with pytest.raises(ConfigError, match=r'an alias \(\*\) stands there.*in "<unicode string>", line 2, column 10'):
+        config.loads("port: &a 14\nrate_hz: *a", Recorder, "a.yaml")
+
+
+def test_an_error_in_a_file_names_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("ports: 1\n")
+    with pytest.raises(ConfigError, match=rf"^{path}: unknown key 'ports'"):
+        config.load(path, Recorder)
+
+
+def test_a_file_of_just_a_mebibyte_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    head = b"port: 99\n#"
+    path.write_bytes(head + b" " * ((1 << 20) - len(head)))
+    assert config.load(path, Recorder).port == 99
+    path.write_bytes(head + b" " * ((1 << 20) - len(head) + 1))
+    with pytest.raises(ConfigError, match="is larger than 1024 KiB"):
+        config.load(path, Recorder)
+
+
+def test_a_wrong_value_is_repeated_up_to_200_characters() -> None:
+    for letters, shown in ((198, "x" * 198 + "' found"), (199, "x" * 199 + "... found")):
+        with pytest.raises(ConfigError, match=rf"^a\.yaml: port: '{shown}, expected a whole number$"):
+            config.loads(f"port: {'x' * letters}", Recorder, "a.yaml")
+
+
+def test_options_are_declared_with_meaning_bounds_and_choices_in_the_order_of_the_file() -> None:
+    @dataclass(frozen=True)
+    class Kit:
+        zone: str = option("left", "which side", choices=("left", "right"))
+        span_m: tuple[float, float] = option((0.0, 1.0), "from and to [m]", minimum=0, maximum=9)
+        gains: tuple[float, ...] = option(tuple(k / 8 for k in range(60)), "of each channel")
+        bare: int = 3
+        inner: Window = option(Window, "where")
+
+    assert config.sample(Kit).startswith(
+        "# which side (left | right)\nzone: left\n# from and to [m]\nspan_m: [0.0, 1.0]\n"
+    )
+    # the longest option is one line, and one that nobody explained has none above it
+    assert config.sample(Kit).splitlines()[5:7] == [f"gains: [{', '.join(str(k / 8) for k in range(60))}]", "bare: 3"]
+    assert config.dump(Kit()).startswith("zone: left\nspan_m:\n")
+    assert config.loads("", Kit, "a.yaml").inner == Window()
+    for text, sentence in (
+        ("span_m: [1]", "1 values found, expected 2"), ("span_m: [1, 2, 3]", "3 values found, expected 2"),
+        ("zone: up", "'up' found, expected one of left, right"), ("span_m: [1, 10]", r"span_m\[1\]: 10.0 found, expected 0 to 9"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=sentence):
+            config.loads(text, Kit, "a.yaml")

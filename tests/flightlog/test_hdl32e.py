@@ -143,40 +143,9 @@ def test_the_elevations_are_a_comb_of_four_thirds_of_a_degree() -> None:
     assert np.abs(hdl32e.ELEVATION_DEG - comb).max() < 0.005  # printed to 0.01 deg
 
 
-def decoded(packets: Packets) -> npt.NDArray[np.void]:
-    """All points as velodyne-decoder gives them, range gates open."""
-    config = velodyne_decoder.Config(model=velodyne_decoder.Model.HDL32E, min_range=0, max_range=200)
-    stream = velodyne_decoder.StreamDecoder(config)
-    scans = [stream.decode(time_ns / 1e9, payload, True) for time_ns, payload in packets]
-    scans.append(stream.finish(True))
-    return np.concatenate([scan[1] for scan in scans if scan is not None])
-
-
-@pytest.mark.parametrize("mode", [hdl32e.ReturnMode.STRONGEST, hdl32e.ReturnMode.LAST, hdl32e.ReturnMode.DUAL])
-def test_shots_are_timed_as_velodyne_decoder_times_them(monterey_data: Packets, mode: int) -> None:
-    # the mode byte of real packets is changed, as no dual return recording is at hand; equal azimuths per pair of blocks
-    changed = []
-    for time_ns, payload in monterey_data[:10]:
-        raw = np.frombuffer(payload, hdl32e.DATA_DTYPE).copy()
-        raw["return_mode"] = mode
-        raw["blocks"]["returns"]["range"] = np.arange(1000, 1384).reshape(12, 32)  # no equal echoes, no empty ones
-        if mode == hdl32e.ReturnMode.DUAL:
-            raw["blocks"]["azimuth"][:, 1::2] = raw["blocks"]["azimuth"][:, ::2]
-        changed.append((time_ns, raw.tobytes()))
-    points = decoded(changed)
-    assert len(points) == 10 * 12 * 32
-    first = points["time"].astype(float).reshape(10, -1)
-    theirs_ns = np.sort((first - first.min(axis=1, keepdims=True)) * 1e9, axis=1)
-    ours_ns = np.sort(hdl32e.shot_offset_ns(mode).ravel())
-    # float32 seconds within a scan of 0.1 s are good to 4 ns
-    assert np.abs(theirs_ns - ours_ns).max() < 10
-
-
 def test_dual_return_shares_a_firing_between_two_blocks() -> None:
     assert hdl32e.firing_index(0x39).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-    assert hdl32e.packet_ns(0x39) == 276_480
-    assert hdl32e.packet_ns(0x37) == 552_960
-    assert hdl32e.shot_offset_ns(0x37)[11, 31] == 11 * 46_080 + 31 * 1_152
+    assert repr([hdl32e.packet_ns(mode) for mode in (0x39, 0x37)]) == "[276480, 552960]", "whole nanoseconds"
 
 
 def test_every_packet_of_a_vlp16_is_refused_by_name(vlp16_data: Packets) -> None:
@@ -202,6 +171,7 @@ def test_the_position_packets_of_a_vlp16_carry_no_gyros(vlp16_position: Packets)
         (manual_packet(mode=0x36), PacketError, "return mode 0x36"),
         (manual_packet(mode=0), PacketError, "return mode 0x00"),
         (manual_packet(product=0x28), WrongSensorError, "VLP-32C"),
+        (manual_packet(product=0), WrongSensorError, "0x00 is an unknown sensor"),
         (b"\xff\xdd" + manual_packet()[2:], WrongSensorError, "HDL-64E"),
         (manual_packet(product=0xA1), WrongSensorError, "VLS-128"),
         (manual_packet(product=0x77), WrongSensorError, "0x77 is an unknown sensor"),
@@ -215,6 +185,32 @@ def test_what_is_no_packet_of_an_hdl32e_is_refused_in_one_sentence(
     assert str(caught.value).startswith("port 2368: ")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_each_packet_is_told_by_itself_whatever_came_with_it() -> None:
+    upper_and_lower = bytearray(manual_packet())
+    upper_and_lower[1::200] = bytes([0xDD]) * len(upper_and_lower[1::200])
+    kinds = [
+        manual_packet(0x37),
+        manual_packet(0x38),
+        manual_packet(0x39),
+        bytes(upper_and_lower),
+        manual_packet(0x36),
+        manual_packet(flag=0),
+    ]
+    packets = np.frombuffer(b"".join(kinds), hdl32e.DATA_DTYPE)
+    assert hdl32e.is_data(packets).tolist() == [True, True, True, False, False, False]
+    assert hdl32e.is_hdl64e(packets).tolist() == [False, False, False, True, False, False]
+    tags = [tag << 12 for tag in (0, 1, 2, 3)] * 3
+    many = [
+        manual_position(tags),
+        b"\x01" + manual_position(tags)[1:],
+        manual_position([0] * 12),
+        manual_position([7] * 12),
+    ]
+    positions = np.frombuffer(b"".join(many), hdl32e.POSITION_DTYPE)
+    assert hdl32e.is_position(positions).tolist() == [True, False, True, False]
+    assert hdl32e.has_imu(positions).tolist() == [True, True, False, False]
 
 
 def test_one_wrong_block_flag_among_twelve_is_enough_to_refuse() -> None:

@@ -28,7 +28,9 @@ from flightlog.records import FORMAT_VERSION, HostClock, LidarAccount
 S = 10**9
 Read = list[tuple[str, int, bytes]]
 METADATA = {"swath.session": {"host": "test", "boot_id": "1"}}
-ATTACHMENTS = {"config.yaml": b"lidar: {}\n", "mount.yaml": bytes(range(200))}
+ATTACHMENTS = {
+    "config.yaml": b"lidar: {}\n", "mount.yaml": bytes(range(200)), "old.yml": b"", "lasers.bin": b"\x00",
+}  # fmt: skip
 
 
 def messages_of(count: int) -> Read:
@@ -138,6 +140,62 @@ def test_two_readings_at_once_do_not_disturb_each_other(log_file: Path, messages
     assert all(first == second for first, second in pairs)
 
 
+def test_progress_is_told_chunk_by_chunk_and_the_rest_at_the_end(log_file: Path, whole: bytes) -> None:
+    log_file.write_bytes(whole)
+    done: list[int] = []
+    with LogReader(log_file) as log:
+        for _ in log.messages(("/none",), done.append):
+            pass
+    ends = [0, *(offset + size for offset, size in chunks_of(whole)), len(whole)]
+    assert done == np.diff(ends).tolist()
+
+
+def test_the_span_of_a_log_is_that_of_its_messages_whatever_their_order(log_file: Path) -> None:
+    stream = io.BytesIO()
+    writer = LogWriter(stream, metadata={}, attachments={})
+    for time_ns in (50, 30, 90, 10, 70):
+        writer.write("/mavlink/ins", time_ns, records.encode_raw(time_ns, [], "ins"))
+        writer.flush()
+    assert writer.span_ns == (10, 90)
+    assert writer.counts == {"/mavlink/ins": 5}
+    writer.write("/mavlink/ins", 5, records.encode_raw(5, [], "ins"))
+    assert writer.counts == {"/mavlink/ins": 5}, "what waits in the open chunk is not in the file"
+    writer.finish()
+    assert writer.counts == {"/mavlink/ins": 6}
+    assert writer.lost == 0
+    log_file.write_bytes(stream.getvalue())
+    with LogReader(log_file) as log:
+        assert (log.start_ns, log.end_ns) == (5, 90)
+
+
+def test_which_number_means_which_topic_is_said_again_at_flushes_that_are_powers_of_two() -> None:
+    stream = io.BytesIO()
+    writer = LogWriter(stream, metadata={}, attachments={})
+    writer.write("/mavlink/ins", 0, records.encode_raw(0, [], "ins"))
+    said = []
+    for number in range(1, 18):
+        before = stream.getvalue().count(b"swath.topics")
+        writer.flush()
+        if stream.getvalue().count(b"swath.topics") > before:
+            said.append(number)
+    assert said == [1, 2, 4, 8, 16]
+
+
+def test_a_log_of_many_damaged_places_names_the_first_twenty_and_counts_all(log_file: Path) -> None:
+    data = bytearray(written(messages_of(5), flush_each=1))
+    places = chunks_of(bytes(data))
+    assert len(places) == 30
+    for offset, size in places:
+        data[offset + size - 3] ^= 1
+    log_file.write_bytes(data)
+    ours, log = read(log_file)
+    assert ours == []
+    assert (log.damage.count, log.damage.bad_chunks, len(log.damage.places)) == (30, 30, 20)
+    assert log.damage.lost_bytes == sum(size for _, size in places)
+    assert log.damage.places[19].startswith(f"byte {places[19][0]}: a damaged chunk")
+    assert log.damage.reaches == sum(places[-1])
+
+
 def test_a_topic_outside_the_table_is_refused() -> None:
     writer = LogWriter(io.BytesIO(), metadata={}, attachments={})
     with pytest.raises(LogError, match="topic '/imu' is not in the table of records"):
@@ -188,6 +246,11 @@ def test_mcap_reads_the_log_by_its_index_and_finds_all_checksums_right(messages:
     assert {entry.name: entry.metadata for entry in reader.iter_metadata()}["swath.session"] == METADATA[
         "swath.session"
     ]
+    kinds = {attachment.name: attachment.media_type for attachment in reader.iter_attachments()}
+    assert kinds == {
+        "config.yaml": "application/yaml", "mount.yaml": "application/yaml", "old.yml": "application/yaml",
+        "lasers.bin": "application/octet-stream",
+    }  # fmt: skip
     for channel in summary.channels.values():
         assert channel.message_encoding == "cdr"
         assert summary.schemas[channel.schema_id].encoding == "ros2msg"
@@ -452,8 +515,11 @@ def test_a_chunk_without_checksum_whose_records_do_not_add_up_is_damage(log_file
 
 def test_a_bag_without_chunks_is_refused_and_not_taken_for_empty(log_file: Path) -> None:
     foreign(log_file, CompressionType.NONE, chunking=False)
-    with pytest.raises(LogError, match="messages outside of chunks"):
-        LogReader(log_file)
+    whole = log_file.read_bytes()
+    for behind in (0, 30):  # whatever stands behind them
+        log_file.write_bytes(whole[: len(whole) - 37] + b"\xff" * behind)
+        with pytest.raises(LogError, match="messages outside of chunks"):
+            LogReader(log_file)
 
 
 def test_a_log_of_a_newer_format_is_refused(log_file: Path) -> None:

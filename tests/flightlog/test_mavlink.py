@@ -148,6 +148,42 @@ def test_versions_one_and_two_and_signed_frames_are_read(message: Any, one: bool
     assert ours.to_dict() == message.to_dict()
 
 
+@pytest.mark.parametrize("one", [True, False])
+def test_a_frame_says_who_sent_it_and_the_table_too(one: bool) -> None:
+    link = dialect.MAVLink(None, srcSystem=3, srcComponent=154)
+    data = [ATTITUDE.pack(link, force_mavlink1=one), HEARTBEAT.pack(link, force_mavlink1=one)]
+    frames = parsed([(7, b"".join(data)), (8, CLEAN)])
+    assert [frame.sequence for frame in frames[:2]] == [message[2 if one else 4] for message in data]
+    assert [(frame.system, frame.component) for frame in frames[:3]] == [(3, 154), (3, 154), (1, 1)]
+    table = mavlink.table(frames, "ATTITUDE")
+    assert table["system"].tolist() == [3, 1, 1]
+    assert table["component"].tolist() == [154, 1, 1]
+    assert table["host_ns"].tolist() == [7, 8, 8]
+
+
+def test_autopilots_are_who_sends_heartbeats_and_does_not_say_that_it_is_none() -> None:
+    """Trailing zeros of version 2 are no reason to overlook one: type and autopilot may be 0 too."""
+    heartbeats = [
+        (255, 190, (6, 8, 0, 0, 4, 3)), (1, 1, (2, 3, 81, 0, 4, 3)), (1, 154, (26, 8, 0, 0, 4, 3)), (7, 1, (0, 0, 0, 0, 0, 0)),
+        (1, 1, (2, 3, 81, 0, 4, 3)),
+    ]  # fmt: skip
+    stream = b"".join(
+        dialect.MAVLink_heartbeat_message(*fields).pack(dialect.MAVLink(None, srcSystem=system, srcComponent=component))
+        for system, component, fields in heartbeats
+    )
+    other = ATTITUDE.pack(dialect.MAVLink(None, srcSystem=9, srcComponent=1))
+    assert mavlink.autopilots(parsed([(0, other + stream)])) == [(1, 1), (7, 1)]
+    assert mavlink.autopilots([]) == []
+
+
+def test_fields_are_where_the_protocol_puts_them() -> None:
+    """In the order of their sizes, the largest first (mavlink.io, packet serialisation)."""
+    fields = ("custom_mode", "type", "autopilot", "base_mode", "system_status", "mavlink_version")
+    assert [mavlink.field_offset("HEARTBEAT", field) for field in fields] == [0, 4, 5, 6, 7, 8]
+    assert mavlink.field_offset("SYSTEM_TIME", "time_boot_ms") == 8
+    assert mavlink.field_offset("HEARTBEAT", "time_boot_ms") is None
+
+
 def test_the_zeros_that_version_two_cuts_off_come_back() -> None:
     silent = dialect.MAVLink_attitude_message(1234, 0, 0, 0, 0, 0, 0)
     data = silent.pack(sender())
@@ -178,6 +214,8 @@ def test_a_frame_outside_the_dialect_is_kept_but_not_believed() -> None:
     assert [frame.known for frame in frames] == [False] + [True] * 6
     assert (frames[0].name, frames[0].data) == ("UNKNOWN_100000", UNKNOWN_2)
     assert mavlink.decode(frames[0]) is None
+    alone = FrameParser()
+    assert [frame.data for frame in alone.feed(1, UNKNOWN_2)] == [UNKNOWN_2], "it ends with what has arrived"
     assert len(mavlink.table(frames, "ATTITUDE")) == 2
 
 
@@ -189,6 +227,8 @@ def test_noise_that_looks_like_an_unknown_frame_hides_no_good_one() -> None:
         stream = noise + bytes(filler) + data + data
         assert [frame.data for frame in known([(0, stream)])] == [data, data]
         assert [frame.data for frame in known([(0, stream[i : i + 1]) for i in range(len(stream))])] == [data, data]
+    # it ends where the good one does, and so does the stream
+    assert [frame.data for frame in known([(0, bytes((0xFE, len(data) - 2, 0, 1, 1, FREE_ID)) + data)])] == [data]
 
 
 def test_a_frame_with_an_unknown_incompatibility_flag_is_not_read() -> None:

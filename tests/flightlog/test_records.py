@@ -1,3 +1,4 @@
+import re
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from flightlog import records
 from flightlog.errors import LogError
-from flightlog.hdl32e import DATA_DTYPE
+from flightlog.hdl32e import DATA_DTYPE, POSITION_DTYPE
 from flightlog.records import ClockSync, HostClock, LidarAccount, RecordType, SyncMethod, UtcSource
 
 S = 10**9
@@ -41,7 +42,8 @@ def rosbags_decoder(row: RecordType) -> Callable[[bytes], Any]:
 WITNESSES = [mcap_ros2_decoder, rosbags_decoder]
 witness = pytest.mark.parametrize("decoder_of", WITNESSES, ids=["mcap_ros2", "rosbags"])
 
-times = st.integers(0, 2**31 * S - 1)
+times = st.integers(-(2**31) * S, 2**31 * S - 1)
+"""All that ROS 2 can say: whole seconds of 32 bits with a sign."""
 frame_ids = st.text(st.characters(codec="ascii", exclude_characters="\x00"), max_size=20)
 raw_chunks = st.lists(st.tuples(times, st.binary(max_size=40)), max_size=6)
 counts = st.integers(0, 2**32 - 1)
@@ -132,6 +134,60 @@ def test_clock_syncs_read_the_same_everywhere(decoder_of: Any, sync: ClockSync) 
     assert ClockSync(stamp_ns(theirs), theirs.header.frame_id, *(getattr(theirs, name) for name in names)) == sync
 
 
+shots = st.tuples(st.floats(width=32), st.floats(0, 255, width=32))
+angles = st.floats(-7, 7, width=32)
+increments = st.floats(0, 1, width=32)
+
+
+@witness
+@given(times, st.tuples(angles, angles, increments, increments), st.lists(shots, max_size=9))
+def test_lines_read_the_same_everywhere(
+    decoder_of: Any, time_ns: int, fields: tuple[float, ...], given_shots: list[tuple[float, float]]
+) -> None:
+    line = np.zeros((), records.line_dtype(len(given_shots)))
+    line["time_ns"] = time_ns
+    names = ("angle_min", "angle_increment", "time_increment", "scan_time")
+    for name, value in zip(names, fields, strict=True):
+        line[name] = value
+    line["ranges"], line["intensities"] = np.array(given_shots, np.float32).reshape(-1, 2).T
+    data = records.encode_line(line)
+    ours = records.decode_line(data)
+    assert ours.shape == (1,)
+    assert ours.tobytes() == line.tobytes()
+    theirs = cached(decoder_of, records.LINE_SCAN)(data)
+    assert (stamp_ns(theirs), theirs.header.frame_id) == (time_ns, "line_scanner")
+    assert tuple(getattr(theirs, name) for name in names) == fields
+    assert np.array(theirs.ranges, np.float32).tobytes() == line["ranges"].tobytes()
+    assert np.array(theirs.intensities, np.float32).tobytes() == line["intensities"].tobytes()
+    last = fields[0] + fields[1] * (len(given_shots) - 1)
+    assert theirs.angle_max == pytest.approx(last, abs=1e-5)
+    returns = [reach for reach, _ in given_shots if 0.0 < reach < np.inf]
+    assert (theirs.range_min, theirs.range_max) == ((min(returns), max(returns)) if returns else (0.0, 0.0))
+
+
+def test_a_line_is_the_type_that_ros_scanner_drivers_publish() -> None:
+    # sensor_msgs/msg/LaserScan: header, seven float32, then ranges and intensities, each with its count
+    line = np.zeros((), records.line_dtype(2))
+    line["time_ns"], line["angle_min"], line["angle_increment"] = 5 * S + 6, 0.25, 0.5
+    line["time_increment"], line["scan_time"] = 0.125, 4.0
+    line["ranges"], line["intensities"] = (1.5, 2.5), (7.0, 8.0)
+    head = b"\x00\x01\x00\x00" + struct.pack("<iII", 5, 6, 13) + b"line_scanner\x00" + bytes(3)
+    body = struct.pack("<7f", 0.25, 0.75, 0.5, 0.125, 4.0, 1.5, 2.5) + struct.pack("<I2fI2f", 2, 1.5, 2.5, 2, 7.0, 8.0)
+    assert records.encode_line(line) == head + body
+
+
+def test_a_line_with_other_numbers_of_ranges_and_intensities_is_refused() -> None:
+    line = np.zeros((), records.line_dtype(3))
+    data = records.encode_line(line)
+    for place, count in ((-16, 2), (-16, 4), (-32, 2)):
+        damaged = bytearray(data)
+        struct.pack_into("<I", damaged, len(damaged) + place, count)
+        with pytest.raises(LogError, match=rf"^/line_scan: {len(data)} bytes, expected \d+ for \d shots$"):
+            records.decode_line(bytes(damaged))
+    # more behind it is padding, as others may leave it
+    assert records.decode_line(data + bytes(3)).tobytes() == line.tobytes()
+
+
 _CACHE: dict[tuple[Any, str], Callable[[bytes], Any]] = {}
 
 
@@ -151,6 +207,22 @@ def test_a_scan_is_the_type_that_ros_drivers_publish() -> None:
     head = b"\x00\x01\x00\x00" + struct.pack("<iII", 5, 6, 9) + b"velodyne\x00" + bytes(3) + struct.pack("<I", 2)
     assert data.startswith(head)
     assert len(data) == len(head) + 8 + 1206 + 2 + 8 + 1206
+    assert records.encode_scan(5 * S + 6, packets_of(2)) == data
+
+
+def test_a_batch_of_raw_bytes_is_padded_between_its_chunks_and_not_behind_them() -> None:
+    data = records.encode_raw(5 * S + 6, [(1, b"abcde"), (2 * S, b"f")], "ins")
+    head = b"\x00\x01\x00\x00" + struct.pack("<iII", 5, 6, 4) + b"ins\x00"
+    assert (
+        data
+        == head
+        + struct.pack("<I", 2)
+        + struct.pack("<iII", 0, 1, 5)
+        + b"abcde"
+        + bytes(3)
+        + struct.pack("<iII", 2, 0, 1)
+        + b"f"
+    )
 
 
 # Bytes ----------------------------------------------------------------------------------------------------------------
@@ -185,8 +257,9 @@ def test_position_packets_come_as_an_array_and_other_lengths_are_left_out() -> N
     time_ns, packets = records.decode_position(data)
     assert time_ns.tolist() == [5, 7]
     assert packets.tobytes() == one + two
+    assert packets["stamp_us"].tolist() == [int.from_bytes(one[198:202], "little"), 0]
     time_ns, packets = records.decode_position(records.encode_raw(9, [], "velodyne"))
-    assert (time_ns.shape, packets.shape) == ((0,), (0,))
+    assert (time_ns.shape, packets.shape, packets.dtype) == ((0,), (0,), POSITION_DTYPE)
 
 
 SAMPLES = {
@@ -198,6 +271,7 @@ SAMPLES = {
         records.encode_clock_sync(ClockSync(1, "ins", 2, 3.0, 4, 5, 6, 7, SyncMethod.TIMESYNC)),
         records.decode_clock_sync,
     ),
+    "line": (records.encode_line(np.ones((), records.line_dtype(3))), records.decode_line),
     "host clock": (records.encode_host_clock(HostClock(1, 2, 3, 4, 5)), records.decode_host_clock),
 }
 
@@ -208,7 +282,8 @@ def test_a_record_that_was_cut_anywhere_is_a_log_error(name: str) -> None:
     for size in range(len(data)):
         with pytest.raises(LogError) as caught:
             decode(data[:size])
-        assert "\n" not in str(caught.value)
+        # whose bytes they are, and a number to look for
+        assert re.fullmatch(r"(RawBatch|/[a-z_]+): .*\d.*", str(caught.value))
 
 
 @given(st.sampled_from(sorted(SAMPLES)), st.binary(max_size=80), st.booleans())

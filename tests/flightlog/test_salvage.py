@@ -1,5 +1,6 @@
 """A log cut at many places, with bits flipped and stretches missing: what comes out is whole, judged by the mcap library."""
 
+import json
 import random
 from pathlib import Path
 
@@ -125,3 +126,106 @@ def test_the_new_log_is_read_by_a_stream_reader_with_every_checksum(source: Path
     salvage(source, tmp_path / "b.mcap", compression="lz4")
     with (tmp_path / "b.mcap").open("rb") as stream:
         assert sum(1 for _ in StreamReader(stream, validate_crcs=True).records) > 2 * CHUNKS
+
+
+def test_a_person_is_told_what_there_was_and_what_is_lost(source: Path, tmp_path: Path) -> None:
+    whole, places = source.read_bytes(), chunk_places(source)
+    assert examine(source).sentences() == ["24 messages over 0.000 s; the log is whole"]
+    cut, flipped = tmp_path / "cut.mcap", tmp_path / "flipped.mcap"
+    offset, length = places[3]
+    cut.write_bytes(whole[:offset])
+    assert examine(cut).sentences() == [
+        "6 messages over 0.000 s recovered; the log was cut off",
+        "nothing that was in the file is lost; only its index was missing",
+    ]
+    damaged = bytearray(whole)
+    damaged[offset + length // 2] ^= 8
+    flipped.write_bytes(damaged)
+    found = examine(flipped)
+    assert found.sentences() == [
+        "22 messages over 0.000 s recovered",
+        f"lost: {length:,} bytes, 1 damaged chunks",
+        f"  {found.places[0]}",
+    ]
+    assert found.to_mapping() == {
+        "truncated": False, "bad_chunks": 1, "lost_bytes": length, "places": list(found.places),
+    }  # fmt: skip
+
+
+def test_the_new_log_says_what_it_was_made_of(source: Path, tmp_path: Path) -> None:
+    damaged = bytearray(source.read_bytes())
+    offset, length = chunk_places(source)[3]
+    damaged[offset + length // 2] ^= 8
+    (tmp_path / "bad.mcap").write_bytes(damaged)
+    found = salvage(tmp_path / "bad.mcap", tmp_path / "good.mcap")
+    with LogReader(tmp_path / "good.mcap") as log:
+        said = dict(log.metadata[SALVAGE])
+        assert sorted(log.metadata) == ["swath.log", SALVAGE, "swath.session"]
+    assert said["source"] == "bad.mcap"
+    assert json.loads(said["found"]) == found.to_mapping()
+    with (tmp_path / "good.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().library == "swath recover"
+        names = [entry.name for entry in reader.iter_metadata()]
+    assert names.count("swath.log") == 1, "what the writer adds by itself is not copied beside it"
+    assert names.count(SALVAGE) == 1
+
+
+def test_times_are_those_of_the_messages_whatever_their_order_and_a_length_is_in_seconds(tmp_path: Path) -> None:
+    path, seconds = tmp_path / "a.mcap", 10**9
+    with path.open("wb") as stream:
+        writer = LogWriter(stream, metadata={}, attachments={})
+        for time_s in (50, 30, 90, 70):
+            writer.write("/mavlink/ins", time_s * seconds, records.encode_raw(0, [], "ins"))
+        writer.finish()
+    found = examine(path)
+    assert (found.start_ns, found.end_ns) == (30 * seconds, 90 * seconds)
+    assert found.sentences() == ["4 messages over 60.000 s; the log is whole"]
+    assert salvage(path, tmp_path / "b.mcap", compression="none").end_ns == 90 * seconds
+    assert b"none" not in (tmp_path / "b.mcap").read_bytes()
+
+
+def test_progress_is_told_in_bytes_of_the_source(source: Path, tmp_path: Path) -> None:
+    for work in (lambda done: examine(source, done), lambda done: salvage(source, tmp_path / "b.mcap", progress=done)):
+        done: list[int] = []
+        work(done.append)
+        assert sum(done) == source.stat().st_size
+        assert len(done) > CHUNKS
+
+
+def test_what_fails_half_way_leaves_nothing(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "b.mcap"
+    for error, raised, said in (
+        (
+            OSError(28, "No space left on device"),
+            LogError,
+            rf"^{target}: cannot be written \(No space left on device\)$",
+        ),
+        (KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+    ):
+
+        def fail(_: int, error: BaseException = error) -> None:
+            raise error
+
+        monkeypatch.setattr("os.fsync", fail)
+        with pytest.raises(raised, match=said):
+            salvage(source, target)
+        assert not target.exists()
+    with pytest.raises(LogError, match=r"none/b\.mcap: cannot be written \(No such file or directory\)$"):
+        salvage(source, tmp_path / "none" / "b.mcap")
+
+
+def test_damage_at_the_end_alone_is_told_from_damage_before_it(source: Path, tmp_path: Path) -> None:
+    """A torn tail is a power cut, and expected; a hole before it is a card that fails."""
+    whole, places = source.read_bytes(), chunk_places(source)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(whole[: places[8][0] + 70])
+    assert examine(path).torn_tail_only
+    damaged = bytearray(whole[: places[8][0] + 70])
+    damaged[places[3][0] + 200] ^= 1
+    path.write_bytes(damaged)
+    assert not examine(path).torn_tail_only
+    damaged = bytearray(whole)
+    damaged[places[3][0] + 200] ^= 1
+    path.write_bytes(damaged)
+    assert not examine(path).torn_tail_only

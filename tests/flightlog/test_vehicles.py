@@ -1,6 +1,7 @@
 """Who the autopilot is: by evidence, by type, by component; anew after silence. Frames are pymavlink's."""
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -86,21 +87,74 @@ def test_a_stranger_cannot_disarm_and_silence_is_doubt() -> None:
     assert vehicles.armed(SILENT_NS + 1) is None
 
 
-def test_who_comes_back_waits_until_the_other_is_silent() -> None:
-    vehicles = heard(attitude(0, 1), attitude(S, 2), attitude(2 * S + SILENT_NS, 2))
+@pytest.mark.parametrize("word", [attitude, beat])
+def test_who_comes_back_waits_until_the_other_is_silent(word: Callable[..., Frame]) -> None:
+    vehicles = heard(word(0, 1), word(S, 2), word(2 * S + SILENT_NS, 2))
     assert vehicles.autopilot == (2, 1)
     for k in range(4, 10):
-        vehicles.hear(attitude(k * S, 1))
-        vehicles.hear(attitude(k * S + 1, 2))
+        vehicles.hear(word(k * S, 1))
+        vehicles.hear(word(k * S + 1, 2))
     assert vehicles.autopilot == (2, 1), "both are heard: no change without need"
-    vehicles.hear(attitude(10 * S + SILENT_NS, 1))
+    vehicles.hear(word(10 * S + SILENT_NS, 1))
     assert vehicles.autopilot == (1, 1)
+    assert vehicles.vehicles() == [(1, 1), (2, 1)]
+
+
+def test_a_newcomer_is_believed_once_the_other_was_silent_for_more_than_three_seconds() -> None:
+    assert heard(beat(0), beat(SILENT_NS, 3)).autopilot == (1, 1)
+    assert heard(beat(0), beat(SILENT_NS + 1, 3)).autopilot == (3, 1)
+
+
+def test_of_two_that_fly_the_one_with_a_heartbeat_is_believed() -> None:
+    vehicles = heard(attitude(0, 2), attitude(1, 3), beat(2, 3))
+    assert vehicles.autopilot == (3, 1)
+    assert vehicles.vehicles() == [(3, 1), (2, 1)]
+
+
+def test_each_change_of_the_autopilot_is_told_once() -> None:
+    vehicles = Vehicles()
+    words = [
+        beat(0, 252, 0, kind=6), beat(1, 7), beat(2, 7), attitude(3, 7), attitude(4, 3), beat(5, 3), beat(6, 7),
+        attitude(7 + SILENT_NS, 3), beat(8 + SILENT_NS, 3, kind=6), attitude(9 + SILENT_NS, 7),
+    ]  # fmt: skip
+    told = [vehicles.hear(word) for word in words]
+    #  a station, 7, no news, that it flies, another flies too, and says so, no news; 7 is silent; it was a station; 7 is back
+    assert told == [False, True, False, False, False, False, False, True, True, True]
+    assert vehicles.autopilot == (7, 1)
+
+
+def test_what_a_sender_said_is_counted_and_kept() -> None:
+    vehicles = heard(beat(5), beat(6, armed=True), attitude(7), attitude(8), attitude(9))
+    sender = vehicles.senders[1, 1]
+    assert (sender.frames, sender.heartbeats, sender.evidence) == (5, 2, 3)
+    assert (sender.first_ns, sender.newest_ns, sender.armed_ns) == (5, 9, 6)
+    assert sender.armed is True
+
+
+def test_zeros_that_mavlink_2_leaves_out_are_put_back_at_the_end() -> None:
+    """A generic vehicle on the ground may send a heartbeat of nothing but zeros: one byte of it travels."""
+    for fields, armed in (((0, 0, 0, 0, 0, 0), False), ((2, 3, ARMED, 0, 0, 0), True)):
+        speaker = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+        (sent,) = FrameParser().feed(0, bytes(dialect.MAVLink_heartbeat_message(*fields).pack(speaker)))
+        assert len(sent.payload) < 9
+        vehicles = heard(sent)
+        assert vehicles.autopilot == (1, 1)
+        assert vehicles.armed(0) is armed
+        assert vehicles.senders[1, 1].version == 2
+
+
+def test_frames_of_an_unknown_id_prove_nothing() -> None:
+    vehicles = Vehicles()
+    unknown = beat(0)._replace(known=False)
+    assert vehicles.hear(unknown) is False
+    assert vehicles.senders == {}
 
 
 def test_made_up_addresses_fill_no_memory() -> None:
     vehicles = heard(attitude(0), *(beat(k, 2 + k % 250, k // 250 + 1) for k in range(1000)))
     assert len(vehicles.senders) == MOST_SENDERS
     assert vehicles.overlooked == 1000 - MOST_SENDERS + 1
+    assert vehicles.hear(beat(1000, 99, 99)) is False
     assert vehicles.autopilot == (1, 1)
 
 

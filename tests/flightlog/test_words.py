@@ -42,9 +42,18 @@ def test_any_bytes_become_ascii(raw: bytes) -> None:
     assert found.isprintable()
 
 
+def test_a_text_of_fixed_length_ends_at_its_first_zero_byte() -> None:
+    """As C pads it: MAVLink's and the HDL-32E's texts."""
+    assert clean_bytes(b"GPS_TYPE\x00old name\x00") == "GPS_TYPE"
+    assert clean_bytes(b"\x00GPS_TYPE") == ""
+
+
 def test_length_is_bounded() -> None:
     assert len(clean("x" * 10_000)) < 2010
     assert clean("x" * 30, most=10) == "x" * 10 + "..."
+    assert clean("x" * 10, most=10) == "x" * 10, "what just fits is left whole"
+    assert clean_bytes(b"x" * 30, most=10) == "x" * 10 + "..."
+    assert len(clean_lines("a line\n" * 50)) == 20, "a screen is not filled by another machine's shell"
     assert clean_lines("a\nb\x1b\nc", most=2) == [r"b\x1b", "c"]
 
 

@@ -173,6 +173,14 @@ def test_a_silence_in_the_messages_does_no_harm() -> None:
     assert abs(error_ns(found)) < 4 * found.sigma_offset_ns
 
 
+def test_times_stay_whole_nanoseconds_however_large() -> None:
+    """UTC of today is 60 bits of nanoseconds; a float has 53."""
+    start_ns = 1_779_272_223_000_000_001
+    found = Sync("gyro", offset_ns=-3, sigma_offset_ns=1.0, reference_ns=start_ns, drift_ppm=1.0)
+    times_ns = start_ns + np.array([0, 1, 10**6, 10**9], np.int64)
+    assert (found.ins_time_ns(times_ns) - start_ns).tolist() == [-3, -2, 10**6 - 3 + 1, 10**9 - 3 + 1000]
+
+
 # Refusals -------------------------------------------------------------------------------------------------------------
 
 

@@ -1,11 +1,8 @@
 """Shots against velodyne-decoder on a recording, and against a plain loop written from the manual."""
 
-import itertools
-import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +10,7 @@ import pytest
 import velodyne_decoder
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from velodynes import Manual, Told, by_hand, by_velodyne_decoder, packets_of, payloads
 
 from flightlog import hdl32e, records
 from flightlog.errors import PacketError
@@ -25,6 +23,7 @@ ELEVATIONS_DEG = [
     -30.67, -9.33, -29.33, -8.00, -28.00, -6.67, -26.67, -5.33, -25.33, -4.00, -24.00, -2.67, -22.67, -1.33, -21.33, 0.00,
     -20.00, 1.33, -18.67, 2.67, -17.33, 4.00, -16.00, 5.33, -14.67, 6.67, -13.33, 8.00, -12.00, 9.33, -10.67, 10.67,
 ]  # fmt: skip
+MANUAL = Manual(ELEVATIONS_DEG, [0.0] * 32, laser_ns=1_152, firing_ns=46_080, block_ns=46_080)
 
 
 def decode(
@@ -37,70 +36,14 @@ def decode(
     return firings.decode(model.LIDAR.firing, packets, time_ns, gate, lasers or model.LIDAR.lasers)
 
 
-def payloads(capture: Path) -> list[bytes]:
-    """UDP payloads of 1206 bytes of a classic little-endian pcap."""
-    content = capture.read_bytes()
-    found, at = [], 24
-    while at < len(content):
-        (size,) = struct.unpack_from("<I", content, at + 8)
-        if size == 1206 + 42:
-            found.append(content[at + 16 + 42 : at + 16 + size])
-        at += 16 + size
-    return found
-
-
-def by_hand(
-    payload: bytes, time_ns: int, gate: Gate
-) -> list[tuple[int, float, float, float, float, int, int, int, int]]:
-    """Time, x, y, z, azimuth [0.01 deg], range [2 mm], intensity, laser and returns of one packet: a loop over the bytes."""
-    dual = payload[1204] == 0x39
-    blocks = [payload[100 * b : 100 * b + 100] for b in range(12)]
-    azimuths = [struct.unpack_from("<H", block, 2)[0] for block in blocks][:: 2 if dual else 1]
-    steps = sorted((b - a + 18_000) % 36_000 - 18_000 for a, b in itertools.pairwise(azimuths))
-    step = (steps[len(steps) // 2] + steps[(len(steps) - 1) // 2]) / 2
-    width_deg = (gate.fov_end_deg - gate.fov_start_deg) % 360 or 360
-    found = []
-    for firing, azimuth in enumerate(azimuths):
-        pair = blocks[2 * firing : 2 * firing + 2] if dual else [blocks[firing]]
-        for laser in range(32):
-            here = azimuth % 36_000 + step * 1.152 * laser / 46.08
-            # the strongest before the last, for two of one range
-            echoes = [struct.unpack_from("<HB", block, 4 + 3 * laser) for block in reversed(pair)]
-            if dual and echoes[0] == echoes[1]:
-                echoes = echoes[:1]
-            near, far = gate.min_range_m - 1e-9, gate.max_range_m + 1e-9
-            echoes = sorted((e for e in echoes if e[0] > 0 and near <= e[0] * 0.002 <= far), key=lambda echo: echo[0])
-            if (here / 100 - gate.fov_start_deg) % 360 > width_deg:
-                continue
-            for number, (steps_2mm, intensity) in enumerate(echoes, 1):
-                elevation, turned, reach = (
-                    math.radians(ELEVATIONS_DEG[laser]),
-                    math.radians(here / 100),
-                    steps_2mm * 0.002,
-                )
-                found.append(
-                    (
-                        time_ns + 46_080 * firing + 1_152 * laser,
-                        reach * math.cos(elevation) * math.sin(turned),
-                        reach * math.cos(elevation) * math.cos(turned),
-                        reach * math.sin(elevation),
-                        here % 36_000,
-                        steps_2mm,
-                        intensity,
-                        laser,
-                        number + 16 * len(echoes),
-                    )
-                )
-    return found
-
-
-def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
+def assert_same(shots: Shots, expected: Told) -> None:
     """Whole numbers equal, coordinates to what float32 holds of them (131 m: 8 um)."""
-    assert len(shots) == len(expected)
-    if not expected:
+    assert len(shots) == len(expected.returns)
+    assert (shots.gated.outside_fov, shots.gated.no_return, shots.gated.out_of_range) == expected[1:]
+    if not expected.returns:
         return
     time_ns, x, y, z, azimuth, ranges, intensity, laser, returns = (
-        np.array(column) for column in zip(*expected, strict=True)
+        np.array(column) for column in zip(*expected.returns, strict=True)
     )
     assert (shots.time_ns == time_ns).all()
     assert (shots.range_m == (ranges * 0.002).astype(np.float32)).all()
@@ -112,21 +55,13 @@ def assert_same(shots: Shots, expected: list[tuple[Any, ...]]) -> None:
     assert np.abs(off).max() < 0.001  # of coordinates as float32: 2^-24 each, 1e-7 rad together
 
 
-def packets_of(content: list[bytes]) -> npt.NDArray[np.void]:
-    return np.frombuffer(b"".join(content), hdl32e.DATA_DTYPE)
-
-
 @pytest.fixture(scope="module")
 def monterey(recordings: Path) -> list[bytes]:
     return payloads(recordings / "lidar/hdl32e_monterey.pcap")
 
 
 def test_a_recording_decodes_as_velodyne_decoder_decodes_it(monterey: list[bytes]) -> None:
-    config = velodyne_decoder.Config(model=velodyne_decoder.Model.HDL32E, min_range=0.0, max_range=1000.0)
-    decoder = velodyne_decoder.StreamDecoder(config)
-    clouds = [cloud for i, payload in enumerate(monterey) if (cloud := decoder.decode(i * 553e-6, payload, True))]
-    rest = decoder.finish(True)
-    theirs = np.concatenate([cloud[1] for cloud in clouds] + ([rest[1]] if rest else []))
+    theirs = by_velodyne_decoder(monterey, velodyne_decoder.Model.HDL32E, 553e-6)
     ours = decode(packets_of(monterey), np.arange(len(monterey), dtype=np.int64) * 553_000)
     assert len(ours) == len(theirs) > 800_000
     assert (ours.intensity == theirs["intensity"]).all()
@@ -141,13 +76,31 @@ def test_a_recording_decodes_as_velodyne_decoder_decodes_it(monterey: list[bytes
     assert (across <= np.deg2rad(0.011) * ours.range_m).all()
 
 
+@pytest.mark.parametrize("mode", [hdl32e.ReturnMode.STRONGEST, hdl32e.ReturnMode.LAST, hdl32e.ReturnMode.DUAL])
+def test_shots_are_timed_as_velodyne_decoder_times_them(monterey: list[bytes], mode: int) -> None:
+    # the mode byte of real packets is changed, as no dual return recording is at hand; equal azimuths per pair of blocks
+    packets = packets_of(monterey[:10]).copy()
+    packets["return_mode"] = mode
+    packets["blocks"]["returns"]["range"] = np.arange(1000, 1384).reshape(12, 32)  # no equal echoes, no empty ones
+    if mode == hdl32e.ReturnMode.DUAL:
+        packets["blocks"]["azimuth"][:, 1::2] = packets["blocks"]["azimuth"][:, ::2]
+    points = by_velodyne_decoder([packet.tobytes() for packet in packets], velodyne_decoder.Model.HDL32E, 553e-6)
+    shots = decode(packets, np.zeros(10, np.int64))
+    assert len(points) == len(shots) == 10 * 12 * 32
+    seconds = points["time"].astype(float).reshape(10, -1)
+    theirs_ns = np.sort((seconds - seconds.min(axis=1, keepdims=True)) * 1e9, axis=1)
+    ours_ns = np.sort(shots.time_ns.reshape(10, -1), axis=1)
+    # float32 seconds within a scan of 0.1 s are good to 4 ns
+    assert np.abs(theirs_ns - ours_ns).max() < 10
+
+
 def test_a_recording_decodes_as_the_loop_by_hand_does(monterey: list[bytes]) -> None:
     chosen = [p for p in monterey if any(struct.unpack_from("<H", p, 100 * b + 2)[0] == 36_000 for b in range(12))]
     assert chosen, "the recording has an azimuth of 36000"
     for payload in [*chosen, *monterey[::300]]:
         for gate in (Gate(), Gate(255.0, 105.0, 1.0, 70.0)):
             shots = decode(packets_of([payload]), np.array([7_000_000_000], np.int64), gate)
-            assert_same(shots, by_hand(payload, 7_000_000_000, gate))
+            assert_same(shots, by_hand(MANUAL, payload, 7_000_000_000, gate))
 
 
 @st.composite
@@ -181,15 +134,16 @@ GATES = st.sampled_from([
 @given(payload=turning_packet(), gate=GATES)
 def test_any_packet_decodes_as_the_loop_by_hand_does(payload: bytes, gate: Gate) -> None:
     shots = decode(packets_of([payload]), np.array([-5], np.int64), gate)
-    expected = by_hand(payload, -5, gate)
+    expected = by_hand(MANUAL, payload, -5, gate)
+    # exactly on the edge the last bit of a float decides; every shot of the packet is asked, those without a return too
+    everywhere = b"".join(payload[100 * b : 100 * b + 4] + 32 * b"\x64\x00\x00" for b in range(12)) + payload[1200:]
     near_edge = any(
-        min((row[4] / 100 - edge) % 360, (edge - row[4] / 100) % 360) < 1e-7
-        for row in by_hand(payload, -5, Gate(0, 360, gate.min_range_m, gate.max_range_m))
+        min((row.azimuth_cdeg / 100 - edge) % 360, (edge - row.azimuth_cdeg / 100) % 360) < 1e-7
+        for row in by_hand(MANUAL, everywhere, -5, Gate()).returns
         for edge in (gate.fov_start_deg, gate.fov_end_deg)
     )
-    if near_edge and len(shots) != len(expected):  # exactly on the edge: the last bit of a float decides
-        return
-    assert_same(shots, expected)
+    if not near_edge or shots.gated.outside_fov == expected.outside_fov:
+        assert_same(shots, expected)
 
 
 @settings(max_examples=100, deadline=None)
@@ -221,6 +175,41 @@ def test_an_equal_pair_is_one_return_and_the_nearer_is_return_one(data_payload: 
         (0, 5000, 0x21), (0, 6000, 0x22), (1, 4000, 0x21), (1, 5000, 0x22), (2, 5000, 0x21), (2, 5000, 0x22), (3, 5000, 0x11),
     ]  # fmt: skip
     assert set(rows[7:]) == {(k, 5000, 0x11) for k in range(4, 32)}
+
+
+def test_the_sweep_of_a_block_is_turned_by_sine_and_cosine() -> None:
+    """As far as a block may sweep, 2 deg."""
+    fraction, elevation = np.linspace(0.0, 1.0, 32), np.deg2rad(ELEVATIONS_DEG)
+    for step in (0.0, 8.3, 79.0, 200.0):
+        found = np.empty((2, 32))
+        firings._directions(step, fraction, np.cos(elevation)[None, :], found)
+        angle = np.deg2rad(step / 100.0 * fraction)
+        np.testing.assert_allclose(found[0], np.cos(elevation) * np.cos(angle), rtol=1e-10)
+        np.testing.assert_allclose(found[1], np.cos(elevation) * np.sin(angle), atol=1e-10)
+
+
+def test_both_ends_of_a_window_are_within_it(data_payload: Callable[..., bytes]) -> None:
+    """The blocks of 90.00 and 91.00 deg: their first lasers fire just there, the others behind."""
+    packet = packets_of([data_payload(0, range(8_600, 9_800, 100))])
+    shots = decode(packet, np.zeros(1, np.int64), Gate(90.0, 91.0))
+    assert (shots.time_ns // 46_080).tolist() == [4] * 32 + [5]
+    assert shots.laser.tolist() == [*range(32), 0]
+    assert shots.gated.outside_fov == 384 - 33
+    dual = packets_of([data_payload(0, np.repeat(range(8_600, 9_200, 100), 2).tolist(), mode=0x39)])
+    shots = decode(dual, np.zeros(1, np.int64), Gate(90.0, 91.0))
+    assert (shots.time_ns // 46_080).tolist() == [4] * 32 + [5]
+    assert shots.gated.outside_fov == 192 - 33
+
+
+def test_columns_are_as_narrow_as_the_clouds_they_fill(data_payload: Callable[..., bytes]) -> None:
+    """Enough packets for memory that is lent, and few."""
+    for count in (1, 400):
+        packets = packets_of([data_payload(0, range(0, 192, 16))] * count)
+        shots = decode(packets, np.zeros(count, np.int64))
+        assert len(shots) == 384 * count
+        names = ("time_ns", "xyz_m", "range_m", "intensity", "laser", "returns")
+        kinds = [getattr(shots, name).dtype for name in names]
+        assert kinds == [np.int64, np.float32, np.float32, np.uint8, np.uint8, np.uint8]
 
 
 def test_a_batch_is_cut_where_the_return_mode_changes(data_payload: Callable[..., bytes]) -> None:

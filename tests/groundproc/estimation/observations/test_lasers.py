@@ -1,14 +1,12 @@
-"""Corrections of the lasers: their columns against moved clusters, recovery in a made-up room, clusters apart, and the file."""
+"""Corrections of the lasers: their columns against moved clusters, recovery in a made-up room, and clusters apart."""
 
 from dataclasses import replace
-from pathlib import Path as File
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from flightlog.errors import ConfigError
 from flightlog.hdl32e import ELEVATION_DEG, LASERS
 from groundproc.estimation.observations.lasers import PRIOR, UNKNOWNS, Corrections, shifted
 from groundproc.estimation.observations.planes import Rows, rows_of
@@ -16,8 +14,6 @@ from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.slices import Clusterer, Slice
 from groundproc.estimation.odometry.spline import Path
-from groundproc.sensors.hdl32e import LIDAR
-from groundproc.sensors.lasers import LaserCorrections, read_lasers, write_lasers
 
 Array = npt.NDArray[np.float64]
 INTERVALS = 10
@@ -164,23 +160,3 @@ def test_lasers_are_told_apart_where_that_is_asked_for() -> None:
     found = np.column_stack([np.floor(world).astype(int), apart["laser"]]).tolist()
     assert len(found) == len(expected)
     assert {tuple(each) for each in found} == expected
-
-
-def test_a_file_is_read_as_it_was_written(tmp_path: File) -> None:
-    numbers = np.random.default_rng(6).normal(size=(2, LASERS)).round(3)
-    made = LaserCorrections(tuple((numbers[0] / 100).tolist()), tuple((numbers[1] / 10).tolist()))
-    path = tmp_path / "lasers.yaml"
-    write_lasers(path, made, "# of one sensor\n")
-    assert path.read_text().startswith("# of one sensor\n")
-    assert read_lasers(path) == made
-    table = read_lasers(path).table(LIDAR.lasers)
-    np.testing.assert_allclose(np.rad2deg(table.elevation_rad), np.array(ELEVATION_DEG) + made.elevation_deg)
-    np.testing.assert_allclose(table.range_offset_m, made.range_m)
-    for text, message in (
-        ("range_m: [0.1, 0.2]", "range_m has 2 numbers, expected 32"),
-        (f"range_m: {[0.0] * 31 + [3.0]}", r"range_m\[31\]: 3.0 found, expected -0.5 to 0.5"),
-        ("ranges: []", "unknown key 'ranges'"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ConfigError, match=message):
-            read_lasers(path).table(LIDAR.lasers, str(path))
