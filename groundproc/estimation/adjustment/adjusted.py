@@ -28,6 +28,7 @@ from groundproc.estimation.adjustment.windows import (
     whole_stiffness,
 )
 from groundproc.estimation.direct import ins_estimate
+from groundproc.estimation.filtered import filtered_estimate
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.attitudes import attitude_track
@@ -52,7 +53,7 @@ LEAST_LASERS: Final = 8
 
 
 def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observation] = ()) -> Estimate:
-    """Adjust every run of the lidar's clock, begun from the autopilot's solution.
+    """Adjust every run of the lidar's clock, begun from the smoother's solution.
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
             f"adjusted: a {given.lidar.name} has {len(given.lidar.lasers)} laser; at least {LEAST_LASERS} are needed to see "
             "a surface again at once"
         )
-    begun = ins_estimate(given, progress)
+    begun = begun_from(given, progress)
     start = begun.trajectory
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
@@ -103,6 +104,19 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
         warning="; ".join(warnings),
         figures=_figures(main, given, trajectory) | ({} if corrections is None else corrections.figures(given.lasers)),
     )
+
+
+def begun_from(given: Given, progress: Progress) -> Estimate:
+    """What the adjustment begins from, and hands back at worst: the smoother's solution, whose heading and tilt are the better ones.
+
+    The autopilot's own where nothing of the future may be used, and where the smoother has not what it needs.
+    """
+    if given.survey.causal:
+        return ins_estimate(given, progress)
+    try:
+        return filtered_estimate(given, progress)
+    except LogError:
+        return ins_estimate(given, progress)
 
 
 def _figures(run: "Run | CausalRun", given: Given, trajectory: Trajectory) -> Figures:
