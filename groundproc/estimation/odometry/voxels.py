@@ -23,6 +23,8 @@ LEAST_FLATNESS_M2: Final = 1e-4
 
 FEWEST: Final = 12
 """Returns that make a plane."""
+MOST_RETURNS: Final = 400.0
+"""Returns that count for the direction of a normal, at most."""
 FLATTEST_M: Final = 0.05
 """Deviation from a plane beyond which a voxel is none, one sigma [m]."""
 NARROWEST: Final = 0.16
@@ -162,7 +164,7 @@ def _insert(
                 v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
                 v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
                 v[FLATNESS] = max(low, 0.0)
-                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, 400.0) * middle)
+                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
             elif low > LEAST_SPREAD_M**2 and total >= FEWEST_SCATTERED:
                 largest, _ = flattest_of(v[SCATTER : SCATTER + 6], -s, longest)
                 for c in range(3):
