@@ -21,7 +21,7 @@ _LINES = ((-42.0, -22.0), (40.0, -22.0), (40.0, -6.0), (-40.0, -6.0), (-40.0, 10
 def _away(rng: np.random.Generator, taken_m: list[Array], half_m: tuple[float, float], apart_m: float) -> Array:
     """A spot (east, north) so far from those taken, which it joins."""
     while True:
-        spot = rng.uniform(-1.0, 1.0, 2) * np.array(half_m)
+        spot: Array = rng.uniform(-1.0, 1.0, 2) * np.array(half_m)
         if all(np.linalg.norm(spot - other) > apart_m for other in taken_m):
             taken_m.append(spot)
             return spot

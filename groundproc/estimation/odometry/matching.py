@@ -78,13 +78,13 @@ class _Clusters(NamedTuple):
     Attributes
     ----------
     body_m : ndarray, shape (n, 3)
-        In the body at the slice's end.
-    count : ndarray of int32, shape (n,)
+        In the body at slice end.
+    returns : ndarray of int32, shape (n,)
         Returns of each.
     """
 
     body_m: Array
-    count: npt.NDArray[np.int32]
+    returns: npt.NDArray[np.int32]
 
 
 class Normal(NamedTuple):
@@ -267,7 +267,7 @@ def _accumulate(
                 off[c] = (
                     mat[c, 0] * body[n, 0] + mat[c, 1] * body[n, 1] + mat[c, 2] * body[n, 2] + position[c] - v[MEAN + c]
                 )
-            _add_filled(v, mat, body[n], off, clusters.count[n], planes.voxel_m, sums.rest)
+            _add_filled(v, mat, body[n], off, clusters.returns[n], planes.voxel_m, sums.rest)
             continue
         squares += e * e
         _row(mat, body[n], v[NORMAL], v[NORMAL + 1], v[NORMAL + 2], j)
