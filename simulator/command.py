@@ -20,7 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="scene, duration and options of a named flight, or of a file; --flights lists them",
     )
     parser.add_argument("--flights", action="store_true", help="list the named flights and end")
-    parser.add_argument("--scene", metavar="NAME", help="village, field, facade, panels, town, lake or wood (village)")
+    parser.add_argument(
+        "--scene",
+        metavar="NAME",
+        help="village, field, facade, panels, town, lake, wood, meadow, barefield, crops, slope or facades (village)",
+    )
     parser.add_argument("--duration", type=float, metavar="S", help="seconds of flight (20)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same bytes (1)")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for what is written")

@@ -23,8 +23,10 @@ from simulator.ground import add_ground, ground_height
 from simulator.lake import lake
 from simulator.meshes import box, catenary, prism, quad
 from simulator.moving import Tracks, flat, over_ground
+from simulator.natural import bare_field, crops, meadow, slope
 from simulator.parts import Parts, World
 from simulator.route import Route, eights
+from simulator.street import facades
 from simulator.town import town
 from simulator.wood import wood
 
@@ -194,6 +196,11 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] =
     "town": (town, Mount()),
     "lake": (lake, Mount()),
     "wood": (wood, Mount()),
+    "meadow": (meadow, Mount()),
+    "barefield": (bare_field, Mount()),
+    "crops": (crops, Mount()),
+    "slope": (slope, Mount()),
+    "facades": (facades, Mount()),
 }
 
 

@@ -82,3 +82,9 @@ def test_the_flights_are_listed(capsys):
     assert command.run(parser.parse_args(["--flights"])) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in plans.names())
+
+
+@pytest.mark.parametrize("name", ["meadow", "hover_lines", "crops", "slope", "barefield", "facades"])
+def test_natural_scenes_are_flown_with_the_instruments_of_the_survey(name):
+    plan, survey = plans.plan(name), plans.plan("survey_fast_gyro")
+    assert replace(plan.options, flight=survey.options.flight) == survey.options

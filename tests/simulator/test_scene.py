@@ -1,6 +1,7 @@
 """The scenes hold what they promise, and shapes are what geometry says."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -147,3 +148,51 @@ def test_water_returns_hardly_anything_and_the_shore_does(simulate):
 def test_an_unknown_scene_is_refused_with_the_known_ones():
     with pytest.raises(UsageError, match="'moon' is not known; known are village"):
         scene("moon", 1)
+
+
+@pytest.mark.parametrize("name", ["meadow", "barefield", "crops", "slope", "facades"])
+def test_a_natural_scene_is_another_with_another_seed(name):
+    first, again, other = (scene(name, seed).world.triangles_m for seed in (1, 1, 2))
+    assert (first == again).all()
+    assert first.shape != other.shape or (first != other).any()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("name", ["meadow", "barefield", "crops", "slope"])
+def test_survey_lines_keep_clear_of_the_ground(name, seed):
+    """Between two corners a line is straight and the ground is not: still it stays 4 m above what lies below."""
+    built = scene(name, seed)
+    world = built.world
+    ground = world.triangles_m[world.surface == world.names.index("ground")].mean(axis=1)
+    points = np.array(built.route.points_m)
+    for start, end in pairwise(points):
+        for share in np.linspace(0.0, 1.0, 9):
+            at = start + share * (end - start)
+            near = np.linalg.norm(ground[:, :2] - at[:2], axis=1) < 1.5
+            assert at[2] - ground[near, 2].max() > 4.0
+
+
+def test_the_meadow_has_what_tells_the_way_and_the_bare_field_has_not():
+    names = " ".join(scene("meadow", 3).world.names)
+    for thing in ("tufts", "line tree", "tree 4", "car 1"):
+        assert thing in names
+    assert set(scene("barefield", 3).world.names) == {"ground", "far ground"}
+    assert scene("meadow", 3, "hover").route.hold_s > 10.0
+
+
+def test_crops_stand_in_rows():
+    world = scene("crops", 4).world
+    plants = world.triangles_m[world.surface == world.names.index("crops")].mean(axis=1)
+    # along the rows' direction the plants are many, across they come every 0.75 m
+    angle = np.linspace(-0.35, 0.35, 141)
+    across = -np.sin(angle)[:, None] * plants[::97, 0] + np.cos(angle)[:, None] * plants[::97, 1]
+    strength = np.abs(np.exp(2j * np.pi * across / 0.75).mean(axis=1))
+    assert strength.max() > 0.25
+    assert np.median(strength) < 0.1
+
+
+def test_the_slope_is_one():
+    world = scene("slope", 5).world
+    ground = world.triangles_m[world.surface == world.names.index("ground")].mean(axis=1)
+    rise, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
+    assert 11.0 < np.degrees(np.arctan(np.hypot(rise[0], rise[1]))) < 21.0

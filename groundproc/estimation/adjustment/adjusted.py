@@ -5,11 +5,13 @@ packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, 
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from flightlog import frames
 from flightlog.errors import LogError
 from groundproc.estimation.adjustment.causal import CausalRun, causal_run
 from groundproc.estimation.adjustment.figures import Figures, odometry_figures, outcome_figures, stated_figures
@@ -28,6 +30,7 @@ from groundproc.estimation.adjustment.windows import (
     whole_stiffness,
 )
 from groundproc.estimation.direct import ins_estimate
+from groundproc.estimation.filtered import filtered_estimate
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.attitudes import attitude_track
@@ -52,7 +55,7 @@ LEAST_LASERS: Final = 8
 
 
 def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observation] = ()) -> Estimate:
-    """Adjust every run of the lidar's clock, begun from the autopilot's solution.
+    """Adjust every run of the lidar's clock, begun from the smoother's solution.
 
     Parameters
     ----------
@@ -73,7 +76,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
             f"adjusted: a {given.lidar.name} has {len(given.lidar.lasers)} laser; at least {LEAST_LASERS} are needed to see "
             "a surface again at once"
         )
-    begun = ins_estimate(given, progress)
+    begun = begun_from(given, progress)
     start = begun.trajectory
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
@@ -91,7 +94,14 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     mount = main.mount(given.mount)
     warnings = [w for run in made for w in run.warnings()] + [str(reason) for reason in reasons]
     corrections = main.corrections()
-    trajectory = joined([own_part(start, run) if run.is_worse() else run.trajectory(given, mount) for run in made])
+    trajectory = joined(
+        [
+            on_fixes(own_part(start, run), given)
+            if run.is_worse()
+            else run.bridged(run.trajectory(given, mount), start)
+            for run in made
+        ]
+    )
     return Estimate(
         trajectory,
         mount,
@@ -103,6 +113,19 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
         warning="; ".join(warnings),
         figures=_figures(main, given, trajectory) | ({} if corrections is None else corrections.figures(given.lasers)),
     )
+
+
+def begun_from(given: Given, progress: Progress) -> Estimate:
+    """What the adjustment begins from, and hands back at worst: the smoother's solution, whose heading and tilt are the better ones.
+
+    The autopilot's own where nothing of the future may be used, and where the smoother has not what it needs.
+    """
+    if given.survey.causal:
+        return ins_estimate(given, progress)
+    try:
+        return filtered_estimate(given, progress)
+    except LogError:
+        return ins_estimate(given, progress)
 
 
 def _figures(run: "Run | CausalRun", given: Given, trajectory: Trajectory) -> Figures:
@@ -125,6 +148,20 @@ def own_part(start: Trajectory, run: Run | CausalRun) -> Trajectory:
     """The part of what was begun from that lies within a run."""
     first = run.path.start_ns
     return start.after(first - 1).before(int(grid_ns(run.path)[-1]))
+
+
+def on_fixes(part: Trajectory, given: Given) -> Trajectory:
+    """A trajectory moved as a whole to where the plain mean of the autopilot's positions has it, as an adjusted one lies (`fixes`)."""
+    antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
+    total, weight = np.zeros(3), np.zeros(3)
+    for leg in given.placed:
+        fixes = position_track(given, leg)
+        poses, known = part.where_covered(fixes.time_ns)
+        arm = frames.mat_from_quat(poses.quat_local_ins_wxyz[known]) @ antenna
+        off = fixes.position_m[known] - poses.position_m[known] - arm
+        total += (off / fixes.sigma_m[known] ** 2).sum(axis=0)
+        weight += (fixes.sigma_m[known] ** -2).sum(axis=0)
+    return replace(part, position_m=part.position_m + total / weight) if weight.all() else part
 
 
 def adjust_run(

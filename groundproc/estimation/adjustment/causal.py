@@ -54,6 +54,11 @@ class CausalRun:
         attitude = np.hypot(attitude, ATTITUDE_SIGMA_RAD * np.array([1.0, 1.0, 2.5]))
         return of_ins(self.path, self.motion, given.frame, mount, np.hypot(position, self.start_sigma_m), attitude)
 
+    def bridged(self, made: Trajectory, begun: Trajectory) -> Trajectory:
+        """As it is: what it began from knows of no more."""
+        del begun
+        return made
+
     def corrections(self) -> None:
         """The lasers are taken as they are given."""
 

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.mount import Mount
+from groundproc.estimation.adjustment.bridging import bridged, misleading, stretches, unheld
 from groundproc.estimation.adjustment.joining import Joined
 from groundproc.estimation.adjustment.sensorpath import lost, of_ins
 from groundproc.estimation.adjustment.windows import (
@@ -156,11 +157,11 @@ class Run:
         return Outcome(self.path, [window.log[-1] for window in self.windows], told, self.is_misled())
 
     def blind_s(self) -> float:
-        """Seconds in which the lidar saw next to no planes, the first one left out: there is no map yet."""
-        return float(sum(m < 50 for m in self.track.matched[10:]) * H)
+        """Seconds in which the lidar does not hold the path, the first one left out: there is no map yet."""
+        return float(unheld(self.track).sum() * H)
 
     def is_blind(self) -> bool:
-        """Whether the lidar saw nothing for most of the flight: without better positions it then knows no more than what it began from."""
+        """Whether the lidar held nothing for most of the flight: without better positions it then knows no more than what it began from."""
         return self.blind_s() > 0.5 * len(self.track) * H and not self.sources.leads()
 
     def slid_sigmas(self) -> float:
@@ -175,18 +176,24 @@ class Run:
         """Whether what the adjustment began from is better than what it made of it."""
         return self.is_blind() or self.is_misled()
 
+    def bridged(self, made: Trajectory, begun: Trajectory) -> Trajectory:
+        """A trajectory of this run with the motion of what it began from where the lidar sees nothing that tells the way."""
+        if self.sources.leads():
+            return made
+        return bridged(made, begun, stretches(misleading(self.track), int(self.path.start_ns)))
+
     def note(self) -> str:
         """What a reader must know though nothing is wrong."""
         if self.is_misled():
             return "the lidar misled the adjustment: the trajectory is what it began from"
         if self.is_blind():
-            return "the lidar saw next to no planes for most of the flight: the trajectory is what the adjustment began from"
+            return "for most of the flight the lidar sees nothing that tells the way: the trajectory is what the adjustment began from"
         blind, whole = self.blind_s(), len(self.track) * H
         if blind <= 0.02 * whole:
             return ""
         return (
-            f"{blind:.1f} s of {whole:.1f} s without planes to hold on to: there the path is the inertial sensors' and the GNSS's, "
-            "and its sigma says so"
+            f"{blind:.1f} s of {whole:.1f} s without planes or leaves to hold on to: there the path is the inertial sensors' "
+            "and the GNSS's, and its sigma says so"
         )
 
     def report(self, nominal: Mount) -> dict[str, Any]:

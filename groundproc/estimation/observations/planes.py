@@ -30,6 +30,8 @@ ROUGHNESS_M: Final = 0.006
 """Roughness of a surface before its residuals tell, one sigma of a cluster [m]."""
 GROUND_SLICES: Final = 201
 """Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
+FLAT: Final = 1e-3
+"""Share of a slice's information below which a direction counts as not observed."""
 SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
 """What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
 
@@ -190,7 +192,7 @@ def _drop_unobserved(rows: Rows, poses: _Poses, voxel_m: float) -> None:
     _level(rows.knot, rows.jacobian, poses, normals, level)
     blocks = np.zeros((rows.intervals, 6, 6))
     _blocks(rows.knot, level, rows.weight, blocks)
-    known = np.array([observable(block) if block[3:, 3:].any() else np.eye(6) for block in blocks])
+    known = np.array([observable(block, FLAT) if block[3:, 3:].any() else np.eye(6) for block in blocks])
     affected = np.trace(known, axis1=1, axis2=2) < 5.5
     _keep_known(rows.arrays, affected, known, level, poses.rotation)
     blind = affected & (known[:, 2, 2] < 0.5)

@@ -86,7 +86,7 @@ def redo_beginning(track: Track, motion: Motion, early: Sequence[Slice], state: 
         clusters = seen.clusters.copy()
         clusters["time_ns"] = end_ns - clusters["time_ns"]
         track.clusters[k] = thinned(clusters, seen.world_m, odometry.map, KEPT)
-        track.matched[k], track.residual_m[k] = seen.matched, seen.residual_m
+        track.matched[k], track.residual_m[k], track.unheld_m[k] = seen.matched, seen.residual_m, seen.unheld_m
 
 
 def _map_of(track: Track, motion: Motion, first: int, last: int) -> PlaneMap:

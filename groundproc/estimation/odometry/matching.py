@@ -7,7 +7,19 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.estimation.odometry.state import STATES, StateArrays, apply
-from groundproc.estimation.odometry.voxels import FLATNESS, LEVEL, MEAN, NORMAL, TILT, MapArrays, find
+from groundproc.estimation.odometry.voxels import (
+    COUNT,
+    FLATNESS,
+    LEVEL,
+    LONGEST,
+    MEAN,
+    MOST_RETURNS,
+    NORMAL,
+    SPREAD,
+    TILT,
+    MapArrays,
+    find,
+)
 from groundproc.numerics.rotations import mat_of_quat, quat_difference, unit_vector
 from groundproc.numerics.voxelhash import voxel_key
 
@@ -21,11 +33,24 @@ SURFACE_SIGMA_M: Final = 0.015
 INFLATION: Final = 4.0
 """Neighbouring clusters share their errors: so much is taken off their information."""
 GROUND: Final = 0.966
-"""Cosine of the steepest slope of what counts as ground: 15 deg."""
+"""Cosine of what planes of the ground lean from its mean normal at most: 15 deg."""
+FIRST_GROUND: Final = 0.707
+"""The same, from the vertical, while there is no mean normal yet: a slope may be ground too."""
+STANDING: Final = 0.5
+"""Cosine from which on a plane stands, whatever it is known by."""
+SURE_LEAN: Final = 3.0
+"""A plane that leans from the ground by less than so many times what its width allows is none, for it may be ground."""
 GROUND_MEMORY: Final = 0.99
 """What is kept of the sum of the ground's normals from slice to slice: the mean normal is that of some ten seconds."""
-FLAT: Final = 1e-3
-"""Share of the information below which a direction counts as not observed."""
+RELIEF: Final = 1.0
+"""The ground's own normals may tell so many times what all else tells."""
+FILLED_SIGMA_M: Final = 0.05
+"""What leaves and blades differ from the voxel that they fill, one sigma of a cluster: they move, and are seen from elsewhere."""
+FILLED_RETURNS: Final = 4
+"""Returns of a cluster that count for its mean there, at most: those of one instant lie beside each other."""
+TELLS_M: Final = 0.1
+"""Sigma of a direction in one slice from which on nothing is taken of it. Over bare ground, a few planes that are none seem to hold the
+path by some decimetres a slice, and brake it by a metre a second; trees at 30 m hold it to 1 cm."""
 ROUNDS: Final = 4
 
 
@@ -47,7 +72,22 @@ class _Matches(NamedTuple):
     weight: Array
 
 
-class _Normal(NamedTuple):
+class _Clusters(NamedTuple):
+    """Clusters of a slice.
+
+    Attributes
+    ----------
+    body_m : ndarray, shape (n, 3)
+        In the body at slice end.
+    returns : ndarray of int32, shape (n,)
+        Returns of each.
+    """
+
+    body_m: Array
+    returns: npt.NDArray[np.int32]
+
+
+class Normal(NamedTuple):
     """Normal equations of a pose's correction, by rotation in the body and by position.
 
     Attributes
@@ -61,12 +101,28 @@ class _Normal(NamedTuple):
     pull: Array
 
 
+class Sums(NamedTuple):
+    """Normal equations of a slice.
+
+    Attributes
+    ----------
+    rest : Normal
+        Of all that is not ground.
+    level, ground : Normal
+        Of the ground by its mean normal, and by the normals of its voxels.
+    """
+
+    rest: Normal
+    level: Normal
+    ground: Normal
+
+
 @njit(cache=True, nogil=True)
-def observable(information: Array) -> Array:
+def observable(information: Array, least: float) -> Array:
     """Projection of a pose's correction, shape (6, 6), onto what planes really tell of it.
 
-    Of directions that get less than `FLAT` of the information nothing is taken (after Zhang, Kaess, Singh 2016). Turns count by what
-    they move at the mean distance.
+    Of directions that get less than a share `least` of the information nothing is taken (after Zhang, Kaess, Singh 2016). Turns count by
+    what they move at the mean distance.
     """
     turn = information[0, 0] + information[1, 1] + information[2, 2]
     shift = information[3, 3] + information[4, 4] + information[5, 5]
@@ -77,13 +133,18 @@ def observable(information: Array) -> Array:
     values, vectors = np.linalg.eigh(scaled)
     known = np.zeros((6, 6))
     for i in range(6):
-        if values[i] > FLAT * shift:
+        if values[i] > least * shift:
             for a in range(6):
                 for b in range(6):
                     known[a, b] += vectors[a, i] * vectors[b, i]
     known[:3, 3:] /= arm
     known[3:, :3] *= arm
     return known
+
+
+@njit(cache=True, nogil=True)
+def _nothing() -> Normal:
+    return Normal(np.zeros((6, 6)), np.zeros(6))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -97,7 +158,7 @@ def _row(mat: Array, body: Array, nx: float, ny: float, nz: float, out: Array) -
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add(row: Array, weight: float, residual: float, normal: _Normal) -> None:
+def _add(row: Array, weight: float, residual: float, normal: Normal) -> None:
     """Add a row to the lower half of the information and to the pull."""
     information, pull = normal.information, normal.pull
     for a in range(6):
@@ -109,11 +170,16 @@ def _add(row: Array, weight: float, residual: float, normal: _Normal) -> None:
 
 @njit(cache=True, nogil=True)
 def _match(
-    planes: MapArrays, body: Array, counts: npt.NDArray[np.int32], pose: tuple[Array, Array], gate_m: float, found: _Matches,
-    ground: Array,
+    planes: MapArrays, clusters: _Clusters, pose: tuple[Array, Array], gate_m: float, found: _Matches,
+    ground: tuple[Array, float, Array],
 ) -> int:  # fmt: skip
-    """Voxel of each cluster, -1 where it finds no plane, with distance and weight; the normals of ground, up, are added to `ground`."""
+    """Voxel of each cluster, -1 where it finds neither a plane nor one that is filled, with distance and weight of planes.
+
+    `ground` is its mean normal so far, up; the cosine of what leans from it and belongs to it; and the sum that such normals are added to.
+    """
     table, keys, voxels, voxel_m = planes
+    up, cone, total = ground
+    body, counts = clusters
     per_m, (mat, position) = 1.0 / voxel_m, pose
     row, residual, weight = found
     matched = 0
@@ -126,83 +192,170 @@ def _match(
         if row[n] < 0:
             continue
         v = voxels[row[n]]
+        if v[SPREAD] > 0.0:
+            matched += 1
+            continue
         e = v[NORMAL] * x + v[NORMAL + 1] * y + v[NORMAL + 2] * z - v[LEVEL]
         if v[FLATNESS] < 0.0 or abs(e) > gate_m:
             row[n] = -1
             continue
         # a plane known from a few lines is uncertain away from them
         off = (x - v[MEAN]) ** 2 + (y - v[MEAN + 1]) ** 2 + (z - v[MEAN + 2]) ** 2
+        lean = abs(v[NORMAL] * up[0] + v[NORMAL + 1] * up[1] + v[NORMAL + 2] * up[2])
+        if STANDING < lean <= cone and _may_be_ground(v, lean):
+            row[n] = -1
+            continue
         variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * v[FLATNESS] + v[TILT] * off
         weight[n] = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
         residual[n] = e
         matched += 1
-        if abs(v[NORMAL + 2]) > GROUND:
-            signed = weight[n] if v[NORMAL + 2] > 0.0 else -weight[n]
+        if lean > cone:
+            side = v[NORMAL] * up[0] + v[NORMAL + 1] * up[1] + v[NORMAL + 2] * up[2]
+            signed = weight[n] if side > 0.0 else -weight[n]
             for c in range(3):
-                ground[c] += signed * v[NORMAL + c]
+                total[c] += signed * v[NORMAL + c]
     return matched
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _may_be_ground(v: Array, lean: float) -> bool:
+    """Whether a plane leans from the ground, by its cosine, by no more than returns of one or two rings would: they share their errors."""
+    of_one_ring = 0.25 * min(v[COUNT], MOST_RETURNS) * v[TILT]
+    return bool(1.0 - lean * lean < SURE_LEAN**2 * of_one_ring)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_filled(v: Array, mat: Array, body: Array, off: Array, count: int, voxel_m: float, normal: Normal) -> None:
+    """Three rows along the axes of what fills a voxel.
+
+    The mean of a few returns lies about that of the voxel by its spread. What is cut off by the voxel's faces does not move them with
+    the path: evenly filled from face to face, a spread of edge / sqrt(12), it tells nothing.
+    """
+    j, axis = np.empty(6), np.empty((3, 3))
+    axis[0, :], axis[2, :] = v[NORMAL : NORMAL + 3], v[LONGEST : LONGEST + 3]
+    axis[1, 0] = axis[2, 1] * axis[0, 2] - axis[2, 2] * axis[0, 1]
+    axis[1, 1] = axis[2, 2] * axis[0, 0] - axis[2, 0] * axis[0, 2]
+    axis[1, 2] = axis[2, 0] * axis[0, 1] - axis[2, 1] * axis[0, 0]
+    for i in range(3):
+        spread = v[SPREAD + i]
+        moves = max(1.0 - 12.0 * spread / voxel_m**2, 0.0)
+        e = axis[i, 0] * off[0] + axis[i, 1] * off[1] + axis[i, 2] * off[2]
+        variance = spread / min(count, FILLED_RETURNS) + FILLED_SIGMA_M**2
+        weight = moves * min(1.0, 3.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
+        _row(mat, body, axis[i, 0], axis[i, 1], axis[i, 2], j)
+        _add(j, weight, e, normal)
 
 
 @njit(cache=True, nogil=True)
 def _accumulate(
-    voxels: Array, body: Array, mat: Array, found: _Matches, ground: Array, whole: _Normal, level: _Normal
+    planes: MapArrays, clusters: _Clusters, pose: tuple[Array, Array], found: _Matches, ground: Array, sums: Sums
 ) -> float:
-    """Normal equations of all matches, and the same with the mean normal for all ground; gives the sum of squares."""
+    """Normal equations of all matches, those on the ground by its mean normal and by their own apart; gives the sum of squares."""
+    voxels, body = planes.voxels, clusters.body_m
+    mat, position = pose
     row, residual, weight = found
-    added, level_added = whole.information, level.information
-    j = np.empty(6)
+    j, off = np.empty(6), np.empty(3)
     squares = 0.0
-    added[:, :], level_added[:, :] = 0.0, 0.0
-    whole.pull[:], level.pull[:] = 0.0, 0.0
+    for each in (sums.rest, sums.level, sums.ground):
+        each.information[:, :], each.pull[:] = 0.0, 0.0
     for n in range(len(body)):
         if row[n] < 0:
             continue
         v, e = voxels[row[n]], residual[n]
+        if v[FLATNESS] < 0.0:
+            for c in range(3):
+                off[c] = (
+                    mat[c, 0] * body[n, 0] + mat[c, 1] * body[n, 1] + mat[c, 2] * body[n, 2] + position[c] - v[MEAN + c]
+                )
+            _add_filled(v, mat, body[n], off, clusters.returns[n], planes.voxel_m, sums.rest)
+            continue
         squares += e * e
         _row(mat, body[n], v[NORMAL], v[NORMAL + 1], v[NORMAL + 2], j)
-        _add(j, weight[n], e, whole)
-        if abs(v[NORMAL + 2]) > GROUND:
-            side = 1.0 if v[NORMAL + 2] > 0.0 else -1.0
-            _row(mat, body[n], side * ground[0], side * ground[1], side * ground[2], j)
-        _add(j, weight[n], e, level)
-    for a in range(6):
-        for b in range(a):
-            added[b, a], level_added[b, a] = added[a, b], level_added[a, b]
+        lean = v[NORMAL] * ground[0] + v[NORMAL + 1] * ground[1] + v[NORMAL + 2] * ground[2]
+        if abs(lean) <= GROUND:
+            _add(j, weight[n], e, sums.rest)
+            continue
+        _add(j, weight[n], e, sums.ground)
+        side = 1.0 if lean > 0.0 else -1.0
+        _row(mat, body[n], side * ground[0], side * ground[1], side * ground[2], j)
+        _add(j, weight[n], e, sums.level)
+    for each in (sums.rest, sums.level, sums.ground):
+        for a in range(6):
+            for b in range(a):
+                each.information[b, a] = each.information[a, b]
     return squares
+
+
+@njit(cache=True, nogil=True)
+def weakest(information: Array) -> float:
+    """How well the least known direction of a pose is told, one sigma [m]; turns count by what they move at the mean distance."""
+    turn = information[0, 0] + information[1, 1] + information[2, 2]
+    shift = information[3, 3] + information[4, 4] + information[5, 5]
+    arm = np.sqrt(max(turn, 1e-12) / max(shift, 1e-12))
+    scaled = information.copy()
+    scaled[:3, :] /= arm
+    scaled[:, :3] /= arm
+    return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(scaled)[0], 1e-6)))
+
+
+@njit(cache=True, nogil=True)
+def told(sums: Sums) -> Normal:
+    """What a slice tells of the pose: all by mean normals, and of the ground's relief no more than `RELIEF` times as much.
+
+    Normals of flat ground have errors, and thousands of them would seem to hold a place along it, and brake the path where nothing
+    else holds it. So the ground counts by its mean normal. Not by the vertical: the map leans by what the start's tilt was off, and a
+    turn about any other axis than the ground's own normal tilts it. Where walls and trees hold the path as well, the relief's own
+    normals are right enough to help.
+    """
+    base, pull = sums.rest.information + sums.level.information, sums.rest.pull + sums.level.pull
+    known = observable(base, TELLS_M**-2 / max(base[3, 3] + base[4, 4] + base[5, 5], 1e-12))
+    if np.trace(known) < 5.5:
+        across = np.ascontiguousarray(known.T)
+        return Normal(across @ base @ np.ascontiguousarray(known), across @ pull)
+    values, vectors = np.linalg.eigh(base)
+    half = np.sqrt(np.maximum(values, 1e-13 * values[5] + 1e-12))
+    narrow, wide = np.ascontiguousarray(vectors / half), np.ascontiguousarray(vectors * half)
+    more = np.ascontiguousarray(narrow.T) @ (sums.ground.information - sums.level.information) @ narrow
+    share, axes = np.linalg.eigh(0.5 * (more + more.T))
+    kept = np.minimum(np.maximum(share, 0.0), RELIEF)
+    out = wide @ np.ascontiguousarray(axes)
+    asked = np.ascontiguousarray(axes.T) @ (np.ascontiguousarray(narrow.T) @ (sums.ground.pull - sums.level.pull))
+    for i in range(6):
+        asked[i] = asked[i] * kept[i] / share[i] if share[i] > 1e-9 else 0.0
+    return Normal(base + (out * kept) @ np.ascontiguousarray(out.T), pull + out @ asked)
 
 
 @njit(cache=True, nogil=True)
 def update(
     planes: MapArrays, body: Array, counts: npt.NDArray[np.int32], state: StateArrays, covariance: Array, ground: Array
 ) -> Any:
-    """Correct a state by the planes that clusters lie on; gives how many do, their RMS distance, and the covariance."""
+    """Correct a state by the planes and leaves that clusters lie on.
+
+    Gives how many do, their RMS distance from planes, sigma of the direction that they tell least of [m], and the covariance.
+    """
     quat, position = state.quat, state.position_m
     to_pose, mine = np.ascontiguousarray(covariance[:, :6]), np.ascontiguousarray(covariance[:6, :6])
     total = np.zeros(STATES)  # correction so far: the prior pulls back to where it began
     mat, turn = np.empty((3, 3)), np.empty(3)
     before = quat.copy()
-    whole, level = _Normal(np.zeros((6, 6)), np.zeros(6)), _Normal(np.zeros((6, 6)), np.zeros(6))
+    sums = Sums(_nothing(), _nothing(), _nothing())
     factor, inner = np.zeros((6, 6)), np.eye(6)
+    clusters = _Clusters(body, counts)
     found = _Matches(np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body)))
-    normals, up = ground.copy(), ground.copy()
+    normals, up, axis, cone = ground.copy(), ground.copy(), ground.copy(), GROUND
+    if not axis.any():
+        axis[2], cone = 1.0, FIRST_GROUND
+    unit_vector(axis)
     matched, squares = 0, 0.0
     for attempt in range(ROUNDS):
         mat_of_quat(quat, mat)
         gate = 0.5 if attempt == 0 else 0.25
         ground[:] = GROUND_MEMORY * normals
-        matched = _match(planes, body, counts, (mat, position), gate, found, ground)
+        matched = _match(planes, clusters, (mat, position), gate, found, (axis, cone, ground))
         up[:] = ground
         unit_vector(up)
-        squares = _accumulate(planes.voxels, body, mat, found, up, whole, level)
-        added, pull = whole
-        if matched:
-            # normals of flat ground have errors, and thousands of them would seem to hold a place along it: whether anything does is
-            # judged with their mean for all of them, and where nothing does, that is also what counts. Not the vertical: the map
-            # leans by what the start's tilt was off, and a turn about any other axis than the ground's own normal tilts it
-            known = observable(level.information)
-            if np.trace(known) < 5.5:
-                pull = np.ascontiguousarray(known.T) @ level.pull
-                added = np.ascontiguousarray(known.T) @ level.information @ np.ascontiguousarray(known)
+        squares = _accumulate(planes, clusters, (mat, position), found, up, sums)
+        added, pull = told(sums)
         # (P^-1 + A)^-1 by Woodbury's formula: P itself may be too nearly singular to invert. With A = L L^T it stays a covariance
         values, vectors = np.linalg.eigh(added)
         root = np.sqrt(np.maximum(values, 1e-13 * values[5] + 1e-12))
@@ -219,4 +372,5 @@ def update(
             break
     gain = to_pose @ factor
     left = covariance - gain @ (inner @ gain.T)
-    return matched, np.sqrt(squares / max(matched, 1)), 0.5 * (left + left.T)
+    unheld = weakest(sums.rest.information + sums.level.information)
+    return matched, np.sqrt(squares / max(matched, 1)), unheld, 0.5 * (left + left.T)

@@ -13,19 +13,27 @@ Array = npt.NDArray[np.float64]
 Table = npt.NDArray[np.int32]
 Keys = npt.NDArray[np.int64]
 
-COUNT, MEAN, SCATTER, NORMAL, LEVEL, FLATNESS, TILT = 0, 1, 4, 10, 13, 14, 15
-"""Columns of a voxel: returns; their mean (3); scatter about it (6); normal (3); its distance from the origin; variance along it,
-negative where it is no plane; variance of the normal's direction."""
-COLUMNS: Final = 16
+COUNT, MEAN, SCATTER, NORMAL, LEVEL, FLATNESS, TILT, LONGEST, SPREAD = 0, 1, 4, 10, 13, 14, 15, 16, 19
+"""Columns of a voxel: returns; their mean (3); scatter about it (6); normal, or the axis of the least spread (3); its distance from the
+origin; variance along it, negative where it is no plane; variance of the normal's direction. Of what fills its voxel, as leaves do: the
+axis of the largest spread (3), and the variances along the least, the middle and the largest axis (3), 0 for all others."""
+COLUMNS: Final = 22
 LEAST_FLATNESS_M2: Final = 1e-4
 """Returns of one ring share errors: a plane's deviation is taken to be 1 cm at least where its tilt is judged."""
 
 FEWEST: Final = 12
 """Returns that make a plane."""
+MOST_RETURNS: Final = 400.0
+"""Returns that count for the direction of a normal, at most."""
 FLATTEST_M: Final = 0.05
 """Deviation from a plane beyond which a voxel is none, one sigma [m]."""
 NARROWEST: Final = 0.16
 """Least width of the returns across the plane's narrow side, one sigma, in voxels: a single ring on the ground is no plane."""
+
+FEWEST_SCATTERED: Final = 20
+"""Returns that tell how something fills a voxel."""
+LEAST_SPREAD_M: Final = 0.06
+"""Spread along every axis, one sigma, from which on that is what a voxel holds: rings on the ground are lines, and move with the sensor."""
 
 
 class MapArrays(NamedTuple):
@@ -120,7 +128,7 @@ def _insert(
 ) -> int:  # fmt: skip
     table, keys, voxels, voxel_m = planes
     mask, per_m = len(table) - 1, 1.0 / voxel_m
-    normal = np.empty(3)
+    normal, longest = np.empty(3), np.empty(3)
     for n in range(len(world)):
         key = voxel_key(world[n, 0], world[n, 1], world[n, 2], per_m)
         slot = spread(key) & mask
@@ -148,7 +156,7 @@ def _insert(
         v[MEAN + 1] += share * dy
         v[MEAN + 2] += share * dz
         add_scatter(v[SCATTER : SCATTER + 6], 1.0, scatter[n], weight, (dx, dy, dz))
-        v[FLATNESS] = -1.0
+        v[FLATNESS], v[SPREAD] = -1.0, 0.0
         if total >= FEWEST:
             s = 1.0 / total
             low, middle = flattest_of(v[SCATTER : SCATTER + 6], s, normal)
@@ -156,5 +164,10 @@ def _insert(
                 v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
                 v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
                 v[FLATNESS] = max(low, 0.0)
-                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, 400.0) * middle)
+                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
+            elif low > LEAST_SPREAD_M**2 and total >= FEWEST_SCATTERED:
+                largest, _ = flattest_of(v[SCATTER : SCATTER + 6], -s, longest)
+                for c in range(3):
+                    v[NORMAL + c], v[LONGEST + c] = normal[c], longest[c]
+                v[SPREAD], v[SPREAD + 1], v[SPREAD + 2] = low, middle, -largest
     return count

@@ -191,7 +191,7 @@ def test_what_planes_of_two_directions_show_is_all_but_the_way_along_both() -> N
         for point in rng.uniform(-5, 5, (200, 3)):
             j = np.concatenate([np.cross(point, normal), normal])
             information += np.outer(j, j)
-    known = observable(information)
+    known = observable(information, 1e-3)
     np.testing.assert_allclose(known @ known, known, atol=1e-9)
     assert np.trace(known) == pytest.approx(5.0, abs=1e-9)
     np.testing.assert_allclose(known @ [0, 0, 0, 0, 1, 0], 0.0, atol=1e-2)

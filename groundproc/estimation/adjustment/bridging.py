@@ -1,0 +1,153 @@
+"""Stretches in which the lidar does not hold the path, bridged by the motion that the smoother has between their good ends."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from groundproc.estimation.observations.fixes import POSITION_TAU_S
+from groundproc.estimation.odometry.grid import SLICE_NS
+from groundproc.estimation.odometry.matching import TELLS_M
+from groundproc.estimation.odometry.track import Track
+from groundproc.trajectory.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+FEWEST_MATCHED: Final = 50
+"""Clusters that find something in the map, below which a slice is blind."""
+START: Final = 10
+"""First slices that are not counted: there is no map yet."""
+SHORTEST: Final = 100
+"""Slices of a stretch that is bridged: over less than 10 s inertial data between two good ends are better than any GNSS."""
+CLOSED: Final = 5
+"""Slices that seem to hold between two stretches and are fewer belong to them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A stretch to be bridged.
+
+    Attributes
+    ----------
+    begin_ns, end_ns : int
+        UTC of its first and last moment.
+    held_before, held_after : bool
+        Whether the path is good there: it is not where the flight begins or ends with the stretch.
+    """
+
+    begin_ns: int
+    end_ns: int
+    held_before: bool
+    held_after: bool
+
+
+def unheld(track: Track) -> Mask:
+    """Slices in which the lidar does not hold the path, shape (n,): it sees next to nothing, or nothing that tells the way."""
+    return np.asarray(misleading(track) | _silent(track))
+
+
+def misleading(track: Track) -> Mask:
+    """Slices in which the lidar sees enough, and nothing that tells the way, shape (n,): what it seems to tell is noise."""
+    found = (np.array(track.unheld_m) > TELLS_M) & ~_silent(track)
+    found[:START] = False
+    return np.asarray(found)
+
+
+def _silent(track: Track) -> Mask:
+    found = np.array(track.matched) < FEWEST_MATCHED
+    found[:START] = False
+    return np.asarray(found)
+
+
+def stretches(loose: Mask, start_ns: int) -> list[Stretch]:
+    """Stretches of loose slices that are long enough, of slices that begin at `start_ns`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], loose, [False]])))
+    found: list[list[int]] = []
+    for first, last in edges.reshape(-1, 2).tolist():
+        if found and first - found[-1][1] < CLOSED:
+            found[-1][1] = last
+        else:
+            found.append([first, last])
+    return [
+        Stretch(start_ns + first * SLICE_NS, start_ns + last * SLICE_NS, first > START, last < len(loose))
+        for first, last in found
+        if last - first >= SHORTEST
+    ]
+
+
+def bridged(made: Trajectory, begun: Trajectory, loose: Sequence[Stretch]) -> Trajectory:
+    """A trajectory whose loose stretches have the motion of another, laid between the good poses at their ends.
+
+    What the ends do not agree on is spread evenly over the time between them.
+
+    Parameters
+    ----------
+    made, begun : Trajectory
+        As adjusted, and what it began from; stretches that the latter does not cover are left as they are.
+    loose : sequence of Stretch
+    """
+    position, quat = made.position_m.copy(), made.quat_local_ins_wxyz.copy()
+    sigma_position, sigma_attitude = made.sigma_position_m.copy(), made.sigma_attitude_rad.copy()
+    changed = np.zeros(len(made), np.bool_)
+    for each in loose:
+        here = np.flatnonzero((made.time_ns >= each.begin_ns) & (made.time_ns <= each.end_ns))
+        if len(here) < 2 or not (each.held_before or each.held_after):
+            continue
+        time_ns = made.time_ns[here]
+        poses, covered = begun.where_covered(time_ns)
+        if not covered.all():
+            continue
+        seconds = (time_ns - time_ns[0]) * 1e-9
+        position[here], quat[here] = _laid(
+            (made.position_m[here], made.quat_local_ins_wxyz[here]),
+            (poses.position_m, poses.quat_local_ins_wxyz),
+            _shares(seconds, each),
+        )
+        own = np.nan_to_num(np.sqrt(np.diagonal(begun.covariance_at(time_ns), axis1=1, axis2=2)))
+        drift = np.sqrt(-2.0 * np.expm1(-_away(seconds, each)[:, None] / POSITION_TAU_S))
+        sigma_position[here] = np.hypot(sigma_position[here], np.minimum(drift, 1.0) * own[:, :3])
+        sigma_attitude[here] = np.hypot(sigma_attitude[here], own[:, 3:])
+        changed[here] = True
+    if not changed.any():
+        return made
+    velocity, rate = made.velocity_m_s.copy(), made.rate_rad_s.copy()
+    seconds = (made.time_ns - made.time_ns[0]) * 1e-9
+    velocity[changed] = np.gradient(position, seconds, axis=0)[changed]
+    turn = frames.quat_log(frames.quat_multiply(frames.quat_inverse(quat[:-1]), quat[1:])) / np.diff(seconds)[:, None]
+    rate[changed] = np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])[changed]
+    return replace(
+        made, position_m=position, quat_local_ins_wxyz=quat, velocity_m_s=velocity, rate_rad_s=rate,
+        sigma_position_m=sigma_position, sigma_attitude_rad=sigma_attitude,
+    )  # fmt: skip
+
+
+def _shares(seconds: Array, each: Stretch) -> Array:
+    """How much of each pose goes by the stretch's end, the rest by its begin; shape (n,)."""
+    if not each.held_before:
+        return np.ones(len(seconds))
+    return np.asarray(seconds / seconds[-1] if each.held_after else np.zeros(len(seconds)))
+
+
+def _away(seconds: Array, each: Stretch) -> Array:
+    """Time from the nearest good pose [s]; shape (n,)."""
+    since = seconds if each.held_before else np.full(len(seconds), np.inf)
+    until = seconds[-1] - seconds if each.held_after else np.full(len(seconds), np.inf)
+    return np.asarray(np.minimum(since, until))
+
+
+def _laid(good: tuple[Array, Array], motion: tuple[Array, Array], share: Array) -> tuple[Array, Array]:
+    """Positions and attitudes of a motion, shapes (n, 3) and (n, 4), turned and moved so that both its ends lie on good poses."""
+    (place, quat), (way, turn) = good, motion
+    off = frames.quat_multiply(quat, frames.quat_inverse(turn))
+    between = frames.quat_log(frames.quat_multiply(frames.quat_inverse(off[:1]), off[-1:]))
+    turned = frames.quat_multiply(np.repeat(off[:1], len(off), axis=0), frames.quat_exp(share[:, None] * between))
+    laid = []
+    for end in (0, -1):
+        mat = frames.mat_from_quat(off[[end]])[0]
+        laid.append(place[end] + (way - way[end]) @ mat.T)
+    position = laid[0] + share[:, None] * (laid[1] - laid[0])
+    return position, frames.quat_multiply(turned, turn)
