@@ -9,6 +9,8 @@ HELP = "hold a cloud against surveyed points, or two sets of coordinates against
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("cloud", nargs="?", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
     parser.add_argument(
         "--points", type=Path, metavar="CSV", help="surveyed points in the CRS of the cloud: columns id, x, y, z"
@@ -25,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="two sets of coordinates by id: columns id, then x, y, z of each, reference first",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
-    parser.add_argument("--force", action="store_true", help="overwrite the file")
+    add_force(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -34,15 +36,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     from tqdm import tqdm
 
-    from flightlog.errors import SourceError, UsageError
+    from flightlog.errors import UsageError
     from groundproc.assessment import work
+    from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
 
     given = bool(arguments.cloud), bool(arguments.points), bool(arguments.pairs)
     if given not in ((True, True, False), (False, False, True)) or (arguments.pairs and arguments.mode):
         raise UsageError("expected swath assess CLOUD --points CSV [--mode MODE], or swath assess --pairs CSV")
-    if arguments.json is not None and arguments.json.exists() and not arguments.force:
-        raise SourceError(f"{arguments.json}: is there already; --force overwrites it")
+    if arguments.json is not None:
+        claim_file(arguments.json, (".json",), arguments.force)
     if arguments.pairs:
         told, text = work.of_pairs(arguments.pairs)
     else:

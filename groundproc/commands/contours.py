@@ -8,6 +8,8 @@ HELP = "draw contours of a raster of heights, to GeoPackage, GeoJSON or DXF"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("raster", type=Path, metavar="DTM", help="a GeoTIFF of heights")
     parser.add_argument("--interval", type=float, default=0.5, metavar="M", help="between the lines [m]; default: 0.5")
     parser.add_argument(
@@ -16,21 +18,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="a name that ends in .gpkg, .geojson or .dxf"
     )
-    parser.add_argument("--force", action="store_true", help="overwrite the output")
+    add_force(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw them."""
-    from flightlog.errors import CoverageError, SourceError, UsageError
+    from flightlog.errors import CoverageError
+    from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
     from groundproc.raster import geotiff
     from groundproc.vectors import contours, files
 
     output: Path = arguments.output
-    if output.suffix.lower() not in files.ENDINGS:
-        raise UsageError(f"-o {output}: expected a name that ends in {', '.join(files.ENDINGS)}")
-    if output.exists() and not arguments.force:
-        raise SourceError(f"{output}: is there already; --force overwrites it")
+    claim_file(output, files.ENDINGS, arguments.force, [arguments.raster])
     with geotiff.opened(arguments.raster) as raster:
         lines = list(contours.contours(raster, arguments.interval, arguments.shortest))
         if not lines:

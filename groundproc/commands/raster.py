@@ -9,6 +9,8 @@ HELP = "make a raster of clouds: surface model, intensity, density, hillshade, a
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument(
         "clouds", nargs="+", type=Path, metavar="CLOUD",
         help="LAS, LAZ or COPC files of one CRS; or one GeoTIFF of heights, for hillshade, local-relief and sky-view",
@@ -24,20 +26,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cell", type=float, default=0.25, metavar="M", help="size of a cell [m]; default: 0.25")
     parser.add_argument("--crs", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the raster, .tif")
-    parser.add_argument("--force", action="store_true", help="overwrite the output")
+    add_force(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the raster, with a progress bar on a terminal."""
     from tqdm import tqdm
 
-    from groundproc.raster.work import Task, work
+    from groundproc.commands.outputs import claim_file
+    from groundproc.raster.work import SUFFIXES, Task, work
 
+    claim_file(arguments.output, SUFFIXES, arguments.force, arguments.clouds)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
         made = work(
             Task(
-                arguments.clouds, arguments.output, arguments.what, arguments.statistic, arguments.cell, arguments.crs,
-                arguments.force,
+                arguments.clouds, arguments.output, arguments.what, arguments.statistic, arguments.cell, arguments.crs
             ),
             bar.update,
         )  # fmt: skip

@@ -10,6 +10,8 @@ HELP = "measure volumes of a cloud within polygons: cut, fill, net, each with it
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
     parser.add_argument("polygons", type=Path, metavar="POLYGONS", help="GeoPackage or GeoJSON with a CRS")
     parser.add_argument(
@@ -18,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "raster of heights; default: toe",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
-    parser.add_argument("--force", action="store_true", help="overwrite the file")
+    add_force(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -27,8 +29,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from tqdm import tqdm
 
-    from flightlog.errors import SourceError, UsageError
+    from flightlog.errors import UsageError
     from groundproc.analysis import volumes
+    from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
 
     base = arguments.base
@@ -36,8 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--base {base}: expected {', '.join(volumes.BASES)} or the name of a raster that ends in .tif"
         )
-    if arguments.json is not None and arguments.json.exists() and not arguments.force:
-        raise SourceError(f"{arguments.json}: is there already; --force overwrites it")
+    if arguments.json is not None:
+        claim_file(arguments.json, (".json",), arguments.force)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
         found, cloud = volumes.measure(arguments.cloud, arguments.polygons, base, bar.update)
     rows: list[dict[str, Any]] = []

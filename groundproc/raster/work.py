@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import pyproj
 
-from flightlog.errors import GeodesyError, SourceError, UsageError
+from flightlog.errors import GeodesyError, UsageError
 from groundproc import geodesy
 from groundproc.cloud import reader
 from groundproc.files import written_aside
@@ -33,8 +33,6 @@ class Task:
     cell_m : float
     crs : str or None
         EPSG code in place of what the clouds state.
-    force : bool
-        Overwrite.
     """
 
     inputs: Sequence[Path]
@@ -43,7 +41,6 @@ class Task:
     statistic: str | None
     cell_m: float
     crs: str | None = None
-    force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +61,6 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
     UsageError, SourceError, CaptureError, CoverageError, GeodesyError
         What is asked for is not possible, or a file is not as it should be.
     """
-    if task.output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"-o {task.output}: a raster is a GeoTIFF, expected a name that ends in .tif")
-    if task.output.exists() and not task.force:
-        raise SourceError(f"{task.output}: is there already; --force overwrites it")
     chosen = kind(task.what, task.statistic)
     if task.inputs[0].suffix.lower() in SUFFIXES:
         return _of_heights(task, chosen)

@@ -42,7 +42,23 @@ def driven(simulated: Callable[..., Any]) -> Any:
 @pytest.fixture(scope="module")
 def made(driven: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder: Path = tmp_path_factory.mktemp("dynamic") / "out"
-    assert main(["process", str(driven.log), "--method", "dynamic", "--sync", "host", "-o", str(folder)]) == 0
+    assert (
+        main(
+            [
+                "process",
+                str(driven.log),
+                "--method",
+                "dynamic",
+                "--sync",
+                "host",
+                "--products",
+                "cloud.laz,pictures,trims.csv,trims.png",
+                "-o",
+                str(folder),
+            ]
+        )
+        == 0
+    )
     return folder
 
 

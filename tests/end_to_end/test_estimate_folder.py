@@ -29,7 +29,14 @@ def flight(simulated: Callable[..., Any]) -> Any:
 def direct(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The products of a run that estimates all there is: mount and lasers too."""
     return processed(
-        flight.log, tmp_path_factory.mktemp("direct") / "out", "--method", "adjusted", "--lasers", "estimate"
+        flight.log,
+        tmp_path_factory.mktemp("direct") / "out",
+        "--method",
+        "adjusted",
+        "--lasers",
+        "estimate",
+        "--products",
+        "cloud.laz,pictures,adjustment.png,lasers.png",
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 import pytest
+import rasterio
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -51,9 +52,27 @@ class Processed:
         return np.asarray(np.genfromtxt(self.folder / "trajectory.csv", delimiter=",", names=True, dtype=None))
 
 
+def test_without_a_wish_all_products_are_made_and_agree(still_flight: Any, tmp_path: Path) -> None:
+    assert main(["process", str(still_flight.log), "--method", "ins", "-o", str(tmp_path / "out")]) in COMPLETE
+    made = Processed(tmp_path / "out")
+    assert {path.name for path in made.folder.iterdir()} == PRODUCTS | {LEDGER} | {
+        "cloud.copc.laz", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif", "trajectory.gpkg",
+    }  # fmt: skip
+    cloud, octree = made.cloud, laspy.read(made.folder / "cloud.copc.laz")
+    order = np.lexsort((cloud["laser"], cloud.gps_time)), np.lexsort((octree["laser"], octree.gps_time))
+    np.testing.assert_array_equal(cloud.xyz[order[0]], octree.xyz[order[1]])
+    with rasterio.open(made.folder / "density.tif") as density, rasterio.open(made.folder / "dsm.tif") as heights:
+        assert density.read(1).sum() * 0.25**2 == len(cloud)
+        assert heights.transform == density.transform
+        assert heights.read(1, masked=True).max() == np.float32(cloud.z.max())
+
+
 def process(folder: Path, *words: Any, method: str = "ins") -> Processed:
     """Products by the autopilot's own solution where nothing else is said: these tests are about the chain, not about the verdict."""
-    assert main(["process", *(str(word) for word in words), "--method", method, "-o", str(folder)]) in COMPLETE
+    told = [str(word) for word in words]
+    if not {"--products", "--config"} & set(told):
+        told += ["--products", "cloud.laz, pictures"]
+    assert main(["process", *told, "--method", method, "-o", str(folder)]) in COMPLETE
     assert {path.name for path in folder.iterdir()} - {"adjustment.png"} == PRODUCTS | {LEDGER} | set(FILES)
     return Processed(folder)
 

@@ -88,14 +88,14 @@ def test_a_cloud_without_a_crs_gives_a_raster_without_one_and_a_warning(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["c.laz", "-o", "d.png"], "ends in .tif"),
+        (["c.laz", "-o", "d.png"], "ends in .png"),
         (["c.laz", "--what", "dtm", "-o", "d.tif"], "expected one of dsm"),
         (["c.laz", "--cell", "0", "-o", "d.tif"], "cell 0 m"),
         (["c.laz", "--cell", "nan", "-o", "d.tif"], "cell nan m"),
         (["c.laz", "--statistic", "mode", "-o", "d.tif"], "expected one of max"),
         (["c.laz", "--what", "range", "-o", "d.tif"], "has no range"),
         (["c.laz", "other.laz", "-o", "d.tif"], "expected one CRS"),
-        (["c.laz", "-o", "there.tif"], "--force overwrites"),
+        (["c.laz", "-o", "there.tif"], "--force to write over"),
         (["there.tif", "--what", "hillshade", "-o", "d.tif"], "cannot be read as a raster"),
         (["none.laz", "-o", "d.tif"], "none.laz"),
     ],

@@ -70,12 +70,12 @@ def test_no_line_crosses_what_is_not_known(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["d.tif", "-o", "c.shp"], "ends in .gpkg"),
+        (["d.tif", "-o", "c.shp"], "ends in .shp"),
         (["d.tif", "--interval", "0", "-o", "c.gpkg"], "interval 0 m"),
         (["d.tif", "--interval", "1e-6", "-o", "c.gpkg"], "levels"),
         (["d.tif", "--interval", "1000", "-o", "c.gpkg"], "no contour"),
         (["none.tif", "-o", "c.gpkg"], "none.tif"),
-        (["d.tif", "-o", "there.dxf"], "--force overwrites"),
+        (["d.tif", "-o", "there.dxf"], "--force to write over"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_sentence(
