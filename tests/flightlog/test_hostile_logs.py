@@ -41,13 +41,44 @@ def test_a_chunk_of_records_that_no_chunk_holds_ends_at_the_first(tmp_path: Path
 
 def test_what_a_file_unpacks_to_has_a_ceiling(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    message = record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, 0, 0))
-    one = chunk(message * ((16 << 20) // len(message)))
-    path.write_bytes(head() + one * 10)
+    message = record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, 0, 0) + bytes(1 << 20))
+    path.write_bytes(head() + chunk(message * 16) * 10)
     with LogReader(path) as log:
         assert sum(1 for _ in log.messages()) == 0  # a channel that nobody announced
-        assert log.damage.bad_chunks == 7, "three of 16 MiB are below 48 MiB"
+        assert log.damage.bad_chunks == 7, "three of 16 MiB are below 48 MiB and 256 times a few kilobytes"
         assert any("unpacks to more than any log of its size" in place for place in log.damage.places)
+
+
+def test_the_number_of_records_has_a_ceiling_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    message = record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, 0, 0))
+    path.write_bytes(head() + chunk(message * 500_000) * 10)
+    with LogReader(path) as log:
+        for _ in range(2):  # a second reading counts nothing twice
+            assert sum(1 for _ in log.messages()) == 0
+        assert log.damage.bad_chunks == 10 - ((1 << 20) + path.stat().st_size) // 500_000
+        assert any("more records than any log of its size" in place for place in log.damage.places)
+
+
+def test_the_ceiling_is_beyond_what_a_lidar_packs_to_that_stands_still_without_noise(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    returns = struct.pack("<HB", 6_000, 40) * 32
+    with path.open("wb") as stream:
+        writer = LogWriter(stream, metadata={}, attachments={}, compression="zstd")
+        for i in range(200):  # stamps and azimuths alone tell its packets apart
+            packets = range(i * 180, (i + 1) * 180)
+            blocks = [
+                [struct.pack("<HH", 0xEEFF, (n * 12 + b) * 19 % 36_000) + returns for b in range(12)] for n in packets
+            ]
+            scan = b"".join(
+                b"".join(each) + struct.pack("<IH", n * 553, 0x2137) for n, each in zip(packets, blocks, strict=True)
+            )
+            writer.write("/velodyne_packets", i, scan)
+        writer.finish()
+    assert path.stat().st_size * 30 < 200 * len(scan)
+    found = examine(path)
+    assert found.whole
+    assert found.messages == {"/velodyne_packets": 200}
 
 
 def test_the_ceiling_is_beyond_what_telemetry_packs_to(tmp_path: Path) -> None:

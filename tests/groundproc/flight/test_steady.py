@@ -175,7 +175,8 @@ def test_undated_recordings_of_one_computer_keep_its_clock_between_them() -> Non
 @pytest.fixture
 def telemetry(cases: Path) -> Iterator[list[Event]]:
     """A link's frames of 14 s, as recorded."""
-    source = Tlog(cases / "nan_attitude/t.tlog", "ins")
+    path = cases / "nan_attitude/t.tlog"
+    source = Tlog(path, "ins", path)
     yield list(source.events())
     source.close()
 
@@ -192,7 +193,8 @@ def test_the_autopilots_clock_tells_a_step_of_the_ground_stations(telemetry: lis
 
 @pytest.mark.parametrize("name", ["arducopter313_sim", "ardusub_2023", "copter_flight_2015"])
 def test_recorded_links_are_left_as_they_are(recordings: Path, name: str) -> None:
-    source = Tlog(recordings / f"mavlink/{name}.tlog", "ins")
+    path = recordings / f"mavlink/{name}.tlog"
+    source = Tlog(path, "ins", path)
     plain = list(source._as_stamped(source.count))
     found, steady = put_right(plain)
     source.close()
@@ -202,8 +204,8 @@ def test_recorded_links_are_left_as_they_are(recordings: Path, name: str) -> Non
 
 def test_a_recorded_lidar_is_left_as_it_is(recordings: Path) -> None:
     for name in ("hdl32e_monterey", "vlp16_gps"):
-        source = Capture(recordings / f"lidar/{name}.pcap", Ports())
-        plain = list(source._again())
+        source = Capture(recordings / f"lidar/{name}.pcap", Ports(), "ins")
+        plain = list(source._as_stamped())
         found, steady = put_right(plain)
         source.close()
         assert errors_ns(found, plain) == [0] * len(plain)
