@@ -44,6 +44,7 @@ NO_MOUNT: Final = "firmware_config/mount.yaml"
 _FRAME_BYTES: Final = 36
 """Of a usual MAVLink message."""
 _LINKS: Final = "/mavlink/"
+_BOARD_LOGS: Final = "/dataflash/"
 _OWN_LINK: Final = "/mavlink/ins"
 
 
@@ -167,8 +168,10 @@ def _log_damage(summary: Figures) -> Iterator[Reason]:
 
 def _log_lidar(summary: Figures) -> Iterator[Reason]:
     lidar = summary["lidar"]
-    if lidar is None or not (lidar["packets"] or (lidar["account"] or {}).get("received")):
-        yield Reason(BAD, "lidar", "no lidar packets in the log, so that there are no points")
+    if lidar is None or not _has_lidar(summary):
+        # a trajectory can be made of the autopilot alone
+        grade = DOUBTFUL if _has_autopilot(summary) else BAD
+        yield Reason(grade, "lidar", "no lidar packets in the log, so that there are no points")
         return
     account = lidar["account"] or {}
     dropped = account.get("kernel_drops", 0) + account.get("queue_drops", 0)
@@ -182,11 +185,25 @@ def _log_lidar(summary: Figures) -> Iterator[Reason]:
         )
 
 
+def _has_lidar(summary: Figures) -> bool:
+    lidar = summary["lidar"]
+    return lidar is not None and bool(lidar["packets"] or (lidar["account"] or {}).get("received"))
+
+
+def _has_autopilot(summary: Figures) -> bool:
+    """Whether it was heard, or its own log is there."""
+    link = summary["mavlink"].get("ins")
+    return bool(link and link["frames"]) or any(name.startswith(_BOARD_LOGS) for name in summary.get("topics", {}))
+
+
 def _log_autopilot(summary: Figures) -> Iterator[Reason]:
     link = summary["mavlink"].get("ins")
     if link is None or not link["frames"]:
+        if _has_autopilot(summary):
+            return
+        # the lidar alone still gives points in its own frame
         yield Reason(
-            BAD,
+            DOUBTFUL if _has_lidar(summary) else BAD,
             "autopilot",
             "no messages of the autopilot (link ins), so that nothing tells where the lidar was; `swath decode` gives "
             "the points in its own frame",

@@ -83,10 +83,10 @@ def test_a_flight_without_a_fault_is_good() -> None:
         ("truncated", True, DOUBTFUL, "truncated", "swath recover a.mcap"),
         ("damage/bad_chunks", 2, DOUBTFUL, "damaged", "2 pieces"),
         ("messages_damaged", 7, DOUBTFUL, "messages", "7 messages cannot be read"),
-        ("lidar", None, BAD, "lidar", "no lidar packets"),
+        ("lidar", None, DOUBTFUL, "lidar", "no lidar packets"),
         ("lidar/lost_packets", 1000, DOUBTFUL, "lost_packets", "1.8%"),
         ("lidar/account/kernel_drops", 1000, DOUBTFUL, "lost_packets", "1,000 lidar packets"),
-        ("mavlink", {}, BAD, "autopilot", "swath decode"),
+        ("mavlink", {}, DOUBTFUL, "autopilot", "swath decode"),
         ("mavlink/ins/lost_frames", 2000, DOUBTFUL, "lost_frames", "23%"),
         ("mavlink/ins/bad_bytes", 100_000, DOUBTFUL, "bad_bytes", "29%"),
         ("mavlink/ins/gps_fix_type", 1, BAD, "gnss", "never had a fix"),
@@ -99,6 +99,15 @@ def test_each_fault_of_a_log_is_a_reason(path: str, value: Any, grade: str, abou
     found = judge_log(changed(LOG, path, value))
     assert (found.grade, [reason.about for reason in found.reasons]) == (grade, [about])
     assert words in found.line()
+
+
+def test_a_log_of_neither_lidar_nor_autopilot_is_bad() -> None:
+    assert judge_log(changed(changed(LOG, "lidar", None), "mavlink", {})).grade == BAD
+
+
+def test_the_autopilots_own_log_stands_for_its_messages() -> None:
+    board = changed(changed(LOG, "mavlink", {}), "topics", {"/dataflash/ins": {"messages": 9}})
+    assert judge_log(board).grade == GOOD
 
 
 @pytest.mark.parametrize(

@@ -213,7 +213,7 @@ def _write(
     result.dataflash_bytes = sum(flash.content.stat().st_size for flash in flashes)
     if result.lidar_packets:
         session[STATED[1]] = lidar.name
-    session |= {"sources": json.dumps(result.sources), "counters": json.dumps(outcome.counters(joiner))}
+    session |= {"sources": json.dumps(result.sources), "counters": json.dumps(outcome.counters(joiner, sources))}
     writer.add_metadata("swath.session", session)
     writer.finish()
     return result

@@ -16,15 +16,16 @@ _NETWORKS: Final = ("capture", "bag")
 """Kinds of sources in which a lidar can be."""
 
 
-def counters(joiner: Joiner) -> dict[str, Any]:
+def counters(joiner: Joiner, sources: Sequence[Source]) -> dict[str, Any]:
     """The figures of an import, as the log keeps them."""
     count = joiner.count
+    late = sum(source.steady.out_of_order for source in sources if isinstance(source, Capture))
     return {
         "lidar": {name: value for name, value in asdict(count.lidar).items() if not name.startswith("fov")},
         "position_received": count.position_received,
         "position_rejected": count.position_rejected,
         "duplicates": count.duplicates,
-        "reordered": count.reordered,
+        "reordered": count.reordered + late,
         "mavlink_duplicates": count.mavlink_duplicates,
         "senders": {name_of(sender): packets for sender, packets in count.senders.most_common()},
         "sender": name_of(joiner.sender) if joiner.sender else None,

@@ -221,7 +221,8 @@ def summarise(reader: LogReader, progress: Progress | None = None) -> dict[str, 
     damage = reader.damage
     found = summary.result()
     for link, mavlink in found["mavlink"].items():
-        mavlink["notes"] = _vehicle_notes(reader, link) if len(mavlink["autopilots"]) > 1 else []
+        if len(mavlink["autopilots"]) > 1:
+            mavlink["notes"] = _vehicle_notes(reader, link)
     return {
         "file": str(reader.path),
         "bytes": reader.size,

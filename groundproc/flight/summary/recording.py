@@ -93,7 +93,7 @@ def _read(path: Path, kind: Kind, folder: Path, senders: Senders, progress: Prog
             refused = [f"swath import would refuse it: {error}"]
         summary.finish()
         facts, notes = source.facts(), [*source.notes(), *outcome.notes(joiner, [source], Ports()), *refused]
-        session = {"sources": json.dumps([facts]), "counters": json.dumps(outcome.counters(joiner))}
+        session = {"sources": json.dumps([facts]), "counters": json.dumps(outcome.counters(joiner, [source]))}
     finally:
         source.close()
     return {"notes": notes, **_about(facts["bytes"], first_ns, last_ns, session), **summary.result()}

@@ -145,6 +145,7 @@ class TelemetrySummary:
             "gps_after_first_fix": {"reports": self.fixes, "without": self.without_fix} if self.fixes else None,
             "first_system_time_utc": clock.utc_text(self.first_utc_ns) if self.first_utc_ns else None,
             "impossible_system_times": self.impossible_utc,
+            "notes": [],
             "messages": [
                 _kind(key, kind)
                 for key, node in sorted(self.nodes.items())

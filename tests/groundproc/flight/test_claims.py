@@ -129,6 +129,6 @@ def test_receive_times_of_another_rate_than_the_autopilots_clock_tie_nothing(cas
     with LogReader(log) as reader:
         flight = read_flight([reader], "ins")
     with pytest.raises(
-        ClockError, match=r"autopilot: its clock ran at 4\.3\d* times the receive times, expected 1 within 300 ppm"
+        ClockError, match=r"autopilot: its clock ran at 4\.(3|29)\d* times the receive times, expected 1 within 300 ppm"
     ):
         legs(flight.runs, flight.boots, Mount().mat_ins_lidar(), "host")

@@ -63,7 +63,7 @@ def lidar_of(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     ("name", "packets", "says"),
     [
         ("duplicate", 3, "2 packets of the lidar were there twice"),
-        ("reordered", 40, "packets of the lidar were out of order"),
+        ("reordered", 40, "packets or frames were out of order"),
         ("sll2_vlan", 3, ""),
         ("stray_sensor_first", 3, "192.168.1.201 with 3, 192.168.1.77 with 1"),
     ],
@@ -145,7 +145,7 @@ def test_swapped_packets_are_put_in_order_over_the_edges_of_messages_too(
     assert code == 0
     assert payloads(log) == [payload for _, payload in packets]
     late = sum(number < max(order[:i], default=-1) for i, number in enumerate(order))
-    assert f"{late} packets of the lidar were out of order" in said
+    assert f"{late} packets or frames were out of order" in said
     assert counters(log)["reordered"] == late
     lidar = lidar_of(log, capsys)
     assert (lidar["lost_packets"], lidar["out_of_order"]) == (0, 0)

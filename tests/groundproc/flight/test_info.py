@@ -217,16 +217,17 @@ def test_a_cut_log_is_told_and_summed_up_as_far_as_it_goes(
     cut = tmp_path / "cut.mcap"
     content = monterey_log.read_bytes()
     cut.write_bytes(content[: len(content) // 2])
-    assert main(["info", str(cut), "--json"]) == 1
+    assert main(["info", str(cut), "--json"]) == 3
     summary = json.loads(capsys.readouterr().out)
     assert summary["truncated"] is True
     assert 0 < summary["lidar"]["packets"] < 2702
-    assert summary["verdict"] == "bad"
+    assert summary["verdict"] == "doubtful"
     assert {reason["about"] for reason in summary["verdict_reasons"]} == {"truncated", "autopilot"}
-    assert main(["info", str(cut)]) == 1
+    assert main(["info", str(cut)]) == 3
     text = capsys.readouterr().out
     assert "cut off" in text
-    assert text.splitlines()[-1].startswith("verdict: bad: no messages of the autopilot")
+    assert text.splitlines()[-1].startswith("verdict: doubtful: ")
+    assert "no messages of the autopilot" in text.splitlines()[-1]
     assert f"swath recover {cut}" in text
 
 
@@ -266,7 +267,7 @@ def test_a_file_that_is_no_log_is_one_sentence(tmp_path: Path, capsys: pytest.Ca
     text.write_text("these are no packets\n")
     assert main(["info", str(text)]) == 1
     error = capsys.readouterr().err
-    assert "is a packet capture" in error
+    assert "is a text file; expected a flight log" in error
     assert error.count("\n") == 1
 
 
