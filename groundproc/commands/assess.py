@@ -38,12 +38,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from groundproc.assessment import work
+    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
 
     given = bool(arguments.cloud), bool(arguments.points), bool(arguments.pairs)
     if given not in ((True, True, False), (False, False, True)) or (arguments.pairs and arguments.mode):
         raise UsageError("expected swath assess CLOUD --points CSV [--mode MODE], or swath assess --pairs CSV")
+    expect([arguments.cloud], CLOUD, CLOUD_WORDS)
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
     if arguments.pairs:

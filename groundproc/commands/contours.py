@@ -24,12 +24,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw them."""
     from flightlog.errors import CoverageError
+    from groundproc.commands.inputs import RASTER, RASTER_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
     from groundproc.raster import geotiff
     from groundproc.vectors import contours, files
 
     output: Path = arguments.output
+    expect([arguments.raster], RASTER, RASTER_WORDS)
     claim_file(output, files.ENDINGS, arguments.force, [arguments.raster])
     with geotiff.opened(arguments.raster) as raster:
         lines = list(contours.contours(raster, arguments.interval, arguments.shortest))

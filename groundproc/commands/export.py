@@ -28,11 +28,13 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from groundproc.cloud import exports, reader
+    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
 
     output = arguments.output
     exports.format_of(output)
+    expect([arguments.cloud], CLOUD, CLOUD_WORDS)
     claim_file(
         output, [f".{ending.rpartition('.')[2]}" for ending in exports.FORMATS], arguments.force, [arguments.cloud]
     )

@@ -65,7 +65,8 @@ def _summary(path: Path) -> "tuple[dict[str, Any], Verdict | None]":
     from groundproc.flight.summary.recording import recording_kind, summarise_recording
     from groundproc.verdict import judge_log
 
-    expect([path], (*LOG, *_RECORDINGS), LOG_WORDS)
+    bag = ("folder",) if (path / "metadata.yaml").is_file() else ()
+    expect([path], (*LOG, *_RECORDINGS, *bag), LOG_WORDS)
     hidden = not sys.stderr.isatty()
     kind = recording_kind(path)
     size = path.stat().st_size
@@ -81,5 +82,5 @@ def _summary(path: Path) -> "tuple[dict[str, Any], Verdict | None]":
     return summary, judge_log(summary)
 
 
-_RECORDINGS: Final = ("capture", "tlog", "dataflash", "bag", "gzip", "folder")
+_RECORDINGS: Final = ("capture", "tlog", "dataflash", "bag", "gzip")
 """Kinds of `groundproc.flight.kinds` that recordings of other programs are of."""

@@ -12,6 +12,10 @@ YAML: Final = ("yaml", "survey", "mount", "json", "text", "empty")
 SOLUTIONS: Final = ("solution", "poses")
 SOLUTION_WORDS: Final = "an RTKLIB .pos, an SBET, NMEA or a trajectory.csv"
 LOG_WORDS: Final = "a flight log (.mcap)"
+CLOUD: Final = ("cloud",)
+CLOUD_WORDS: Final = "a cloud (LAS, LAZ or COPC)"
+RASTER: Final = ("picture",)
+RASTER_WORDS: Final = "a raster of heights (GeoTIFF)"
 _NAMES: Final = 2000
 """Names of a folder that are looked through for one like that which was typed."""
 

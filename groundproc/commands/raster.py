@@ -33,9 +33,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Make the raster, with a progress bar on a terminal."""
     from tqdm import tqdm
 
+    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, RASTER, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.raster.work import SUFFIXES, Task, work
 
+    expect(arguments.clouds, (*CLOUD, *RASTER), CLOUD_WORDS)
     claim_file(arguments.output, SUFFIXES, arguments.force, arguments.clouds)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
         made = work(

@@ -31,6 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from groundproc.analysis import volumes
+    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
 
@@ -39,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--base {base}: expected {', '.join(volumes.BASES)} or the name of a raster that ends in .tif"
         )
+    expect([arguments.cloud], CLOUD, CLOUD_WORDS)
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:

@@ -156,7 +156,7 @@ def test_an_error_of_the_compressor_reaches_the_writer_and_leaves_no_thread(
             for _ in range(50):
                 cloud.write(few(laser=np.ones(100_000, np.uint8)))
 
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(SourceError, match="No space left"):
         fill()
     assert not [thread for thread in threading.enumerate() if thread.name == "laz"]
 

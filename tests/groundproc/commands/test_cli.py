@@ -58,7 +58,7 @@ def test_a_missing_log_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_a_reader_that_goes_away_leaves_no_traceback(monterey_log: Path) -> None:
     with subprocess.Popen(
-        [BIN / "swath", "info", str(monterey_log), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [BIN / "swath", "info", str(monterey_log)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as run:
         assert run.stdout is not None
         assert run.stderr is not None

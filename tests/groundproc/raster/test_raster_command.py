@@ -96,7 +96,7 @@ def test_a_cloud_without_a_crs_gives_a_raster_without_one_and_a_warning(
         (["c.laz", "--what", "range", "-o", "d.tif"], "has no range"),
         (["c.laz", "other.laz", "-o", "d.tif"], "expected one CRS"),
         (["c.laz", "-o", "there.tif"], "--force to write over"),
-        (["there.tif", "--what", "hillshade", "-o", "d.tif"], "cannot be read as a raster"),
+        (["there.tif", "--what", "hillshade", "-o", "d.tif"], "is a text file; expected a cloud"),
         (["none.laz", "-o", "d.tif"], "none.laz"),
     ],
 )
