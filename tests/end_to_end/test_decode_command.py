@@ -127,6 +127,6 @@ def test_a_place_that_cannot_be_written_is_refused(
     assert main(["decode", str(still_flight.log), "-o", str(tmp_path / "file" / "a.laz")]) == 1
     assert str(tmp_path / "file") in capsys.readouterr().err
     (tmp_path / "a.laz").mkdir()
-    assert main(["decode", str(still_flight.log), "-o", str(tmp_path / "a.laz")]) == 1
-    assert str(tmp_path / "a.laz") in capsys.readouterr().err
+    assert main(["decode", str(still_flight.log), "-o", str(tmp_path / "a.laz")]) == 2
+    assert f"{tmp_path / 'a.laz'}: is a folder" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.laz", "file"]

@@ -106,4 +106,4 @@ def test_a_model_that_is_none_is_refused(driven: Any, tmp_path: Path, capsys: py
     assert main(["process", str(driven.log), *words, "-o", str(tmp_path / "out")]) == 2
     assert "an odd number" in capsys.readouterr().err
     assert main(["compass", str(tmp_path / "none.csv"), "-o", str(tmp_path / "c.yaml")]) == 1
-    assert "none.csv: cannot be read" in capsys.readouterr().err
+    assert "none.csv: no such file" in capsys.readouterr().err

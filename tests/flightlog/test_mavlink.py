@@ -161,21 +161,6 @@ def test_a_frame_says_who_sent_it_and_the_table_too(one: bool) -> None:
     assert table["host_ns"].tolist() == [7, 8, 8]
 
 
-def test_autopilots_are_who_sends_heartbeats_and_does_not_say_that_it_is_none() -> None:
-    """Trailing zeros of version 2 are no reason to overlook one: type and autopilot may be 0 too."""
-    heartbeats = [
-        (255, 190, (6, 8, 0, 0, 4, 3)), (1, 1, (2, 3, 81, 0, 4, 3)), (1, 154, (26, 8, 0, 0, 4, 3)), (7, 1, (0, 0, 0, 0, 0, 0)),
-        (1, 1, (2, 3, 81, 0, 4, 3)),
-    ]  # fmt: skip
-    stream = b"".join(
-        dialect.MAVLink_heartbeat_message(*fields).pack(dialect.MAVLink(None, srcSystem=system, srcComponent=component))
-        for system, component, fields in heartbeats
-    )
-    other = ATTITUDE.pack(dialect.MAVLink(None, srcSystem=9, srcComponent=1))
-    assert mavlink.autopilots(parsed([(0, other + stream)])) == [(1, 1), (7, 1)]
-    assert mavlink.autopilots([]) == []
-
-
 def test_fields_are_where_the_protocol_puts_them() -> None:
     """In the order of their sizes, the largest first (mavlink.io, packet serialisation)."""
     fields = ("custom_mode", "type", "autopilot", "base_mode", "system_status", "mavlink_version")

@@ -13,7 +13,9 @@ from flightlog.errors import LogError, UsageError
 from flightlog.mount import Mount
 from groundproc.estimation import methods
 from groundproc.estimation.method import Given, Method, Progress
+from groundproc.flight.autopilot import Vehicle
 from groundproc.flight.flight import Flight
+from groundproc.flight.vehicle import Choice
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.hdl32e import LIDAR
 from groundproc.sensors.lasers import ESTIMATE, LaserCorrections
@@ -35,7 +37,8 @@ def trajectory() -> Trajectory:
 
 def given(survey: Survey) -> Given:
     """Nothing but a survey and where mount and lasers come from."""
-    return Given((), Flight([], [], LIDAR), (), (), (), LocalFrame(58.4, 15.6, 60.0), Mount(), survey, STATED, "log")
+    flight = Flight([], [], LIDAR, Choice(Vehicle((), [])))
+    return Given((), flight, (), (), (), LocalFrame(58.4, 15.6, 60.0), Mount(), survey, STATED, "log")
 
 
 def quiet(stage: str, done: int) -> None:

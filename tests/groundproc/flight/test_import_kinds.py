@@ -415,9 +415,9 @@ def test_nothing_given_and_files_of_another_kind_are_named(
     archive.write_bytes(b"PK\x03\x04" + bytes(100))
     for words, code, what in (
         ((), 2, "give recordings with --pcap, --mavlink or --bag"),
-        (("--pcap", tlog), 1, "telemetry log; swath import --mavlink"),
-        (("--mavlink", capture), 1, "packet capture, expected a .tlog or a dataflash .bin; swath import --pcap"),
-        (("--pcap", archive), 1, "ZIP archive; unpack it"),
+        (("--pcap", tlog), 1, "a telemetry log of a ground station"),
+        (("--mavlink", capture), 1, "a packet capture; `swath import --pcap"),
+        (("--pcap", archive), 1, "archive"),
         (("--pcap", capture, "--sender", "the lidar"), 2, "is no address"),
         (("--pcap", capture, "--lidar-port", 70_000), 2, "is no UDP port"),
     ):
