@@ -13,7 +13,7 @@ from flightlog.errors import SourceError
 from groundproc.cloud.octree import Cube, Key, Octree
 from groundproc.cloud.spool import Records
 
-_AT_ONCE: Final = 1_500_000
+_AT_ONCE: Final = 1_000_000
 """Points that are handed to the compressor together: its threads share whole nodes."""
 _INFO: Final = struct.Struct("<5d2Q2d88x")
 _ENTRY: Final = struct.Struct("<4iQ2i")

@@ -39,7 +39,7 @@ LEAF: Final = 30_000
 """Points that make no further level."""
 _FEW: Final = 1_000
 """So few points left in a node are given to its parent."""
-_LARGEST_PIECE: Final = 6_000_000
+_LARGEST_PIECE: Final = 750_000
 """Points dealt with at once."""
 _SMALLEST_BITS: Final = 4
 """A square is not split below 2^4 units."""

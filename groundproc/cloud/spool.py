@@ -14,7 +14,7 @@ from groundproc.numerics.voxelhash import sorted_by
 Records = npt.NDArray[np.void]
 Place = tuple[int, int]
 
-_WAITING_BYTES: Final = 96 << 20
+_WAITING_BYTES: Final = 48 << 20
 """In memory before it is written: many squares are written at once, so each gets pieces that are worth compressing."""
 _SMALL: Final = 1 << 12
 """Records of one square that are written before the others have to be."""

@@ -14,6 +14,7 @@ import pytest
 import seeds
 
 from flightlog.logfile import LogWriter
+from groundproc.cli import main
 
 EACH = 8
 """Spoilt files for each door in every run of the tests."""
@@ -26,7 +27,14 @@ def told(found: fuzzing.Findings) -> str:
     return "\n".join(f"{what}: {path}" for what, path in found.wrong.items())
 
 
-def test_good_files_go_through_every_door(tmp_path: Path) -> None:
+def reasons(log: Path, capsys: pytest.CaptureFixture[str]) -> set[str]:
+    """What `swath info` finds wrong with a log that it read to its end."""
+    capsys.readouterr()
+    assert main(["info", "--json", str(log)]) == 1
+    return {reason["about"] for reason in json.loads(capsys.readouterr().out)["verdict_reasons"]}
+
+
+def test_good_files_go_through_every_door(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without this the rest would prove nothing."""
     good = tmp_path / "good"
     fuzzing.good_files(good)
@@ -40,8 +48,11 @@ def test_good_files_go_through_every_door(tmp_path: Path) -> None:
         place = tmp_path / "case"
         place.mkdir()
         data = seeds.scans_csv() if door.name == "scans text" else whole[door.file]
-        what, code = fuzzing.ask(door, seeds.write(place, door.file, data), good)
-        assert (what, code) == ("", 0), door
+        file = seeds.write(place, door.file, data)
+        # the log is whole, but of a second and of few packets: its verdict is bad
+        judged = door.words[0] == "info"
+        assert fuzzing.ask(door, file, good) == ("", 1 if judged else 0), door
+        assert not judged or reasons(file, capsys) == {"together", "lost_packets"}
         shutil.rmtree(place)
 
 
@@ -93,12 +104,16 @@ def hostile_log(path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["info", "info json", "recover", "decode"])
-def test_words_of_a_log_reach_the_terminal_harmless_and_short(tmp_path: Path, command: str) -> None:
+def test_words_of_a_log_reach_the_terminal_harmless_and_short(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "a.mcap"
     hostile_log(path)
     (door,) = (door for door in fuzzing.doors() if door.name == command)
     what, code = fuzzing.ask(door, path, tmp_path)
-    assert code == (1 if command == "decode" else 0)
+    assert code == (0 if command == "recover" else 1)
+    # info read it to its end, and says what is not in it
+    assert "info" not in command or reasons(path, capsys) == {"lidar", "autopilot", "messages"}
     assert not what or (command == "info json" and "characters" in what), what
 
 
@@ -108,8 +123,8 @@ def test_names_of_files_and_keys_of_yaml_reach_the_terminal_harmless(tmp_path: P
     name = "a\x1b[2J\nswath: all is well\u202e.mcap"
     for words in (
         ("info", "{file}"),
-        ("recover", "{file}", "-o", "{out}"),
-        ("import", "--pcap", "{file}", "-o", "{out}"),
+        ("recover", "{file}", "-o", "{out}.mcap"),
+        ("import", "--pcap", "{file}", "-o", "{out}.mcap"),
     ):
         place = tmp_path / "case"
         place.mkdir()
@@ -129,7 +144,7 @@ def test_the_cases_that_failed_once(cases: Path, tmp_path: Path) -> None:
     """Each in a process of its own, with the memory and the time that a small file may cost."""
     hostile = cases / "hostile"
     for words, code in (
-        (["info", hostile / "info_system_time.mcap"], 0),
+        (["info", hostile / "info_system_time.mcap"], 3),  # shown, but without a lidar
         (["info", hostile / "bomb_zstd_256M.mcap"], None),
         (["recover", hostile / "quadratic_500000.mcap", "-o", tmp_path / "r.mcap"], None),
         (["adjust", hostile / "laz_abort.laz", "-t", hostile / "traj.csv", "-o", tmp_path / "o"], 1),

@@ -20,9 +20,9 @@ def repeated(source: Path, target: Path) -> None:
     subprocess.run([sys.executable, TOOL, source, target, "--times", str(TIMES)], check=True, capture_output=True)
 
 
-def summary(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def summary(log: Path, capsys: pytest.CaptureFixture[str], code: int = 0) -> dict[str, Any]:
     capsys.readouterr()
-    assert main(["info", "--json", str(log)]) == 0
+    assert main(["info", "--json", str(log)]) == code
     content: dict[str, Any] = json.loads(capsys.readouterr().out)
     return content
 
@@ -42,7 +42,8 @@ def test_nothing_is_missing_at_the_seams(
     options = replace(Options(), link=replace(Options().link, version=2))
     flight = simulated("short_flight", "field", 2.0, options)
     repeated(flight.log, tmp_path / "long.mcap")
-    one, many = summary(flight.log, capsys), summary(tmp_path / "long.mcap", capsys)
+    # 2 s are too short to make anything of
+    one, many = summary(flight.log, capsys, code=1), summary(tmp_path / "long.mcap", capsys)
     assert many["lidar"]["packets"] == TIMES * one["lidar"]["packets"]
     assert many["lidar"]["missing_packets"] == many["lidar"]["out_of_order"] == 0
     assert many["lidar"]["clock"]["jumps"] == 0
@@ -53,7 +54,8 @@ def test_the_gps_sentences_of_the_lidar_keep_to_its_stamps(
     gps_flight: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     repeated(gps_flight.log, tmp_path / "long.mcap")
-    one, many = (summary(log, capsys) for log in (gps_flight.log, tmp_path / "long.mcap"))
+    # its lidar is thinned: doubtful, once and repeated
+    one, many = (summary(log, capsys, code=3) for log in (gps_flight.log, tmp_path / "long.mcap"))
     check_link(one["mavlink"]["ins"], many["mavlink"]["ins"])
     one, many = one["position"], many["position"]
     assert many["gps"]["unreadable"] == 0

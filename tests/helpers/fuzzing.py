@@ -69,7 +69,7 @@ def doors() -> list[Door]:
         lambda dice: seeds.log(dice),
         lambda dice: seeds.mutated(seeds.log(dice, "none"), dice),
     )
-    recording = ("import", "--pcap", "{good}/a.pcap", "-o", "{out}")
+    recording = ("import", "--pcap", "{good}/a.pcap", "-o", "{out}.mcap")
     kit = (
         "import",
         "--scans",
@@ -79,7 +79,7 @@ def doors() -> list[Door]:
         "--positions",
         "{good}/a.pos",
         "-o",
-        "{out}",
+        "{out}.mcap",
     )
     strips = ("adjust", "{good}/a.laz", "-t", "{good}/t.csv", "-o", "{out}", "--crs", "32633")
 
@@ -89,7 +89,7 @@ def doors() -> list[Door]:
     return [
         Door("info", "a.mcap", ("info", "{file}"), logs),
         Door("info json", "a.mcap", ("info", "--json", "{file}"), logs),
-        Door("recover", "a.mcap", ("recover", "{file}", "-o", "{out}"), logs),
+        Door("recover", "a.mcap", ("recover", "{file}", "-o", "{out}.mcap"), logs),
         Door("decode", "a.mcap", ("decode", "{file}", "-o", "{out}.laz"), logs),
         Door("pcap", "b.pcap", other(recording, "{good}/a.pcap"), (spoilt(seeds.pcap()), spoilt(seeds.pcapng()))),
         Door(

@@ -1,6 +1,7 @@
 """The smoother against dense least squares with numerical derivatives, and the pieces around it against outside values."""
 
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,37 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
     each = sigma[:, :9, None] * sigma[:, None, :9]
     assert np.abs((kept_covariance - poses) / each).max() < 0.03
     np.testing.assert_array_equal(correction, kept[:, :9])
+
+
+def test_the_adjoint_keeps_its_digits_over_a_measurement_far_better_than_what_was_known() -> None:
+    """1 cm where 300 m were known: the covariance before it is P - P N P, and P is 9e4 m2 against some 1e-4 m2 that are sought."""
+    rng = np.random.default_rng(3)
+    state = np.array([0, 1, ATTITUDE])
+    value = np.array([100.0, 3.0, -30.0])
+    half = 1000.0 * rng.standard_normal((STATES, STATES))
+    after = half @ half.T / STATES
+    known = np.diag(np.square(np.r_[np.full(3, 300.0), np.full(STATES - 3, 0.1)]))
+    # north is known from the row before it, as rows are made independent of each other one by one
+    known[1, 1] = 1e-4
+    known[0, 3] = known[3, 0] = 5.0
+    row = np.zeros(STATES)
+    row[state] = value
+    spread = float(row @ known @ row) + 1.0
+    gain = known @ row / spread
+    none, alone = np.zeros(1), np.zeros(1, np.int64)
+    rows = kalman.Rows(alone, np.array([3]), state[None], value[None], none, np.ones(1))
+    tape = kalman.Tape(none, none, gain[None], none, np.array([spread]))
+    found = after.copy()
+    kalman._undo(0, rows, 0, tape, np.zeros(STATES), found, np.empty(STATES))
+
+    exact = np.vectorize(Fraction, otypes=[object])
+    left = exact(np.eye(STATES)) - np.outer(exact(gain), exact(row))
+    true = left.T @ exact(after) @ left + np.outer(exact(row), exact(row)) / Fraction(spread)
+    off = (exact(found) - true).astype(np.float64)
+    assert np.array_equal(found, found.T)
+    np.testing.assert_allclose(off, 0.0, atol=1e-15 * np.abs(after).max())
+    # a tenth of what is sought of the position east
+    assert abs(off[0, 0]) * known[0, 0] ** 2 < 1e-5
 
 
 def test_forward_and_backward_transitions_are_each_others_transposes() -> None:

@@ -114,7 +114,7 @@ def test_the_summary_says_what_came_of_it(run: Callable[..., Path], capsys: pyte
     assert summary["baseline_m"]["longest"] == pytest.approx(far + 60, abs=2)
     assert summary["sigma_m"]["fix"]["horizontal"] < 0.03
     assert summary["base"]["source"] == "header of its RINEX file"
-    run("rover.obs", "base.obs")
+    run("rover.obs", "base.obs", "--force")
     assert "100.0% fix" in capsys.readouterr().out
     header = output.read_text().split("%  GPST")[0]
     assert "rover.obs" in header
@@ -131,7 +131,7 @@ def test_versions_formats_and_base_positions_give_the_same_path(run: Callable[..
         (("rover.ubx", "base.ubx", "--base-position", BASE_TEXT), "brdc.nav"),
     ]
     for words, nav in ways:
-        found = read_solution(run(*words, nav=nav))
+        found = read_solution(run(*words, "--force", nav=nav))
         # UBX has phases as doubles and RINEX to a thousandth of a cycle; ambiguities may be fixed an epoch sooner or later
         apart = np.linalg.norm(world.errors_m(found) - world.errors_m(plain), axis=1)
         assert np.median(apart) < 2e-3, words
@@ -139,7 +139,7 @@ def test_versions_formats_and_base_positions_give_the_same_path(run: Callable[..
     for name in ("rover.obs", "base.obs", "brdc.nav"):
         with (world.folder / name).open("rb") as file, gzip.open(world.folder / f"{name}.gz", "wb") as packed:
             shutil.copyfileobj(file, packed)
-    packed_way = read_solution(run("rover.obs.gz", "base.obs.gz", nav="brdc.nav.gz"))
+    packed_way = read_solution(run("rover.obs.gz", "base.obs.gz", "--force", nav="brdc.nav.gz"))
     np.testing.assert_array_equal(packed_way.latitude_deg, plain.latitude_deg)
 
 
@@ -173,7 +173,7 @@ def test_options_reach_rtklib(run: Callable[..., Path], tmp_path: Path) -> None:
         assert line in text
     found = read_solution(output)
     assert Quality.FIX not in found.quality
-    backward = read_solution(run("rover.obs", "base.obs", "--direction", "backward"))
+    backward = read_solution(run("rover.obs", "base.obs", "--direction", "backward", "--force"))
     assert (np.diff(backward.time_ns) > 0).all()
 
 
@@ -211,7 +211,7 @@ def test_the_configuration_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
         ("rover.obs", "late.obs", (), "brdc.nav", 1, "late.obs: covers 2024-02-07 13:"),
         ("rover.obs", "base.obs", (), "old.nav", 1, "ephemerides of 0 satellites within 2 h"),
         ("rover.obs", "empty.obs", (), "brdc.nav", 1, "empty.obs: holds no observations, expected RINEX epochs"),
-        ("none.obs", "base.obs", (), "brdc.nav", 1, "none.obs: cannot be read"),
+        ("none.obs", "base.obs", (), "brdc.nav", 1, "none.obs: no such file; expected raw observations"),
         ("noise.bin", "base.obs", (), "brdc.nav", 1, "noise.bin: is nothing that is known"),
         ("noise.ubx", "base.obs", (), "brdc.nav", 1, "noise.ubx: holds neither observations"),
         ("hatanaka.crx", "base.obs", (), "brdc.nav", 1, "hatanaka.crx: is Hatanaka-compressed RINEX; crx2rnx"),
@@ -280,5 +280,6 @@ def test_without_rtklib_it_says_what_to_install(
 def test_an_output_that_cannot_be_written(
     run: Callable[..., Path], world: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "none").write_text("a file where a folder must be")
     run("rover.obs", "base.obs", "-o", str(tmp_path / "none" / "out.pos"), code=1)
     assert "cannot be written" in capsys.readouterr().err
