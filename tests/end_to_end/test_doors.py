@@ -16,7 +16,7 @@ import seeds
 from flightlog.logfile import LogWriter
 from groundproc.cli import main
 
-EACH = 8
+EACH = 3
 """Spoilt files for each door in every run of the tests."""
 SOAK_S = 600.0
 MEMORY_BYTES = 1 << 30
