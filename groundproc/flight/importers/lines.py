@@ -21,6 +21,8 @@ IMU_COLUMNS: Final = (
     "time_ns", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2",
 )  # fmt: skip
 _LARGEST: Final = np.repeat([RATE_RAD_S, FORCE_M_S2], 3)
+_LARGEST_VALUE: Final = 1e9
+"""Of a range [m] or an intensity; what is larger no scanner states."""
 _UNEVEN_RAD: Final = np.deg2rad(0.02)
 """Angles of a line may be off an even spacing by this: they are stated to 0.01 deg."""
 _DEFAULT_LINE_S: Final = 1.0 / 18.0
@@ -54,6 +56,10 @@ def read_lines(path: Path) -> npt.NDArray[np.void]:
         )
     if (np.diff(time_ns) <= 0).any():
         raise LogError(f"{path}: times of the lines do not grow")
+    for name, values in (("range", range_m), ("intensity", intensity)):
+        finite = values[np.isfinite(values)]
+        if len(finite) and float(np.abs(finite).max()) > _LARGEST_VALUE:
+            raise LogError(f"{path}: a {name} of {np.abs(finite).max():g}, expected at most {_LARGEST_VALUE:g}")
     step = (angle[-1] - angle[0]) / (len(angle) - 1)
     uneven = float(np.abs(angle - (angle[0] + step * np.arange(len(angle)))).max())
     if uneven > _UNEVEN_RAD:
@@ -127,7 +133,16 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> list[npt.NDArray[
             if comma := decimal_comma(words):
                 raise ValueError(comma)
         rows = (line for line in chain([first], file) if line.strip())
-        values = np.loadtxt(rows, delimiter=found.separator, dtype=np.str_, ndmin=2, usecols=places, quotechar='"')
-    if not len(values):
-        raise ValueError("no rows")
+        head = next(rows, None)
+        if head is None:
+            raise ValueError("no rows")
+        values = np.loadtxt(
+            chain([head], rows),
+            delimiter=found.separator,
+            dtype=np.str_,
+            ndmin=2,
+            usecols=places,
+            quotechar='"',
+            comments=None,
+        )
     return list(values.T)

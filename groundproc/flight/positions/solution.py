@@ -230,6 +230,8 @@ def _within(solution: Solution) -> npt.NDArray[np.bool_]:
         values = getattr(solution, name)
         if values is not None:
             good &= (~(np.abs(values) > most)).reshape(len(good), -1).all(axis=1)
+        if values is not None and values.ndim == 3:  # a variance below 0 is none
+            good &= ~(np.einsum("nii->ni", values) < 0.0).any(axis=1)
     return good
 
 

@@ -119,3 +119,16 @@ def test_the_flight_is_processed_and_its_points_are_true_to_what_the_positions_a
     distance = np.linalg.norm(cloud.xyz - hits, axis=1)
     # path 0.24 m, tilt 0.2 deg and heading 1 deg at 25 m at most, range 1 cm
     assert np.sqrt(np.square(distance).mean()) < np.hypot(0.24, 25.0 * np.deg2rad(1.02)) + 0.01
+
+
+def test_a_head_without_rows_and_values_beyond_any_scanner_are_one_sentence(tmp_path: Path) -> None:
+    imu, scans = tmp_path / "imu.csv", tmp_path / "scans.csv"
+    head = "time_ns,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2\n"
+    for rows in ("", "\n\n"):
+        imu.write_text(head + rows)
+        with pytest.raises(LogError, match=r"imu\.csv.*no rows"):
+            read_imu(imu)
+    lines = "".join(f"{time},{angle},{1e300 if time else 5},7\n" for time in range(3) for angle in (0, 1))
+    scans.write_text("time_ns,angle_deg,range_m,intensity\n" + lines)
+    with pytest.raises(LogError, match=r"scans\.csv: a range of 1e\+300, expected at most 1e\+09"):
+        read_lines(scans)
