@@ -52,7 +52,7 @@ class Backend:
         return Unpacker(self._path, source, header, vlr, self._most)
 
 
-class Unpacker(IPointReader):  # type: ignore[misc]
+class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
     """Points from the other process, in the order of the file.
 
     Parameters

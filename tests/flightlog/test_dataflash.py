@@ -203,7 +203,7 @@ def test_how_a_log_is_cut_into_pieces_and_windows_changes_nothing(parts: list[by
     whole = dataflash.parse(data, "a.bin")
     stretch, window = dataflash._STRETCH, dataflash._WINDOW
     try:
-        dataflash._STRETCH, dataflash._WINDOW = 150, 3  # type: ignore[misc]
+        dataflash._STRETCH, dataflash._WINDOW = 150, 3  # type: ignore[misc]  # constants, made small for the test
         parser, start = dataflash.Parser(), 0
         for size in sizes:
             parser.feed(data[start : start + size])
@@ -211,7 +211,7 @@ def test_how_a_log_is_cut_into_pieces_and_windows_changes_nothing(parts: list[by
         parser.feed(data[start:])
         pieced = parser.finish()
     finally:
-        dataflash._STRETCH, dataflash._WINDOW = stretch, window  # type: ignore[misc]
+        dataflash._STRETCH, dataflash._WINDOW = stretch, window  # type: ignore[misc]  # as they were
     assert repr(tables(pieced)) == repr(tables(whole))
     assert (pieced.bad_bytes, pieced.counts) == (whole.bad_bytes, whole.counts)
 

@@ -41,7 +41,7 @@ def _opened(path: Path, crs: str) -> Any:
     """An empty file with the elements that every E57 has (ASTM E2807, table 1); pye57's own leave the CRS empty for good."""
     from pye57 import E57, libe57
 
-    class File(E57):  # type: ignore[misc]
+    class File(E57):  # type: ignore[misc]  # the library has no types
         def write_default_header(self) -> None:
             file, root = self.image_file, self.root
             file.extensionsAdd("", libe57.E57_V1_0_URI)
