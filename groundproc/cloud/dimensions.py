@@ -154,6 +154,14 @@ TABLE: Final = (
         "decoding", "deg", 0.01,
     ),
     Dimension("range", "u2", "range", "Distance from the sensor as measured, before corrections of the laser.", "sensor", "m", 0.002),
+    Dimension(
+        "reflectance", "f4", "diffuse reflectance",
+        "Share of the light that a surface throws back, as a white Lambertian one throws back all; not a number where the echo is of a "
+        "retro-reflector or beyond what the sensor can tell.", "`swath reflectance`",
+    ),
+    Dimension(
+        "reflectance_sigma", "f4", "sigma of reflectance", "One standard deviation of the reflectance.", "`swath reflectance`",
+    ),
 )  # fmt: skip
 """All columns that points may have, in the order of the file and of the documentation."""
 

@@ -128,7 +128,7 @@ def _header(
     """The header of a file with some attributes; totals come at its end."""
     fields = {entry.field for entry in dimensions}
     header = laspy.LasHeader(version="1.4", point_format=8 if "nir" in fields else 7 if "red" in fields else 6)
-    header.add_extra_dims([_extra(entry) for entry in dimensions if not entry.field])
+    header.add_extra_dims([extra_bytes(entry) for entry in dimensions if not entry.field])
     header.scales, header.offsets = np.full(3, SCALE_M), np.asarray(offset_m, np.float64)
     header.generating_software, header.system_identifier = f"swath {__version__}"[:31], about[:31]
     header.creation_date = datetime.now(UTC).date()
@@ -141,7 +141,8 @@ def _header(
     return header
 
 
-def _extra(entry: Dimension) -> laspy.ExtraBytesParams:
+def extra_bytes(entry: Dimension) -> laspy.ExtraBytesParams:
+    """What laspy wants to know of an attribute that no field of LAS holds."""
     scaled = entry.scale is not None
     return laspy.ExtraBytesParams(
         entry.name,

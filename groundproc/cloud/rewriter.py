@@ -1,6 +1,7 @@
-"""A cloud written anew: same points, attributes, order, header and records, other coordinates."""
+"""A cloud written anew: same points, attributes, order, header and records, other coordinates, or more attributes."""
 
 import contextlib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -10,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError, SourceError
+from groundproc.cloud.dimensions import Dimension, in_order
+from groundproc.cloud.packer import extra_bytes
 from groundproc.cloud.reader import Cloud, opened
 from groundproc.cloud.storing import storing
 
@@ -30,6 +33,8 @@ class Rewriter:
     path : Path
     compressed : bool
         LAZ; else LAS.
+    added : iterable of str
+        Attributes of the table that every `write` gives values of. Extra bytes of that name that the cloud had are replaced.
 
     Raises
     ------
@@ -39,11 +44,13 @@ class Rewriter:
         The new file cannot be written.
     """
 
-    def __init__(self, cloud: Cloud, path: Path, compressed: bool = True) -> None:
+    def __init__(self, cloud: Cloud, path: Path, compressed: bool = True, added: Iterable[str] = ()) -> None:
         self.path, self.name = path, cloud.path
+        self._added = in_order(added)
         with opened(cloud.path) as reader:
-            header = laspy.LasHeader(version=reader.header.version, point_format=reader.header.point_format)
             old = reader.header
+            self._format = _format(old.point_format, [entry for entry in self._added if not entry.field])
+            header = laspy.LasHeader(version=old.version, point_format=self._format)
             header.scales, header.offsets = old.scales, old.offsets
             header.global_encoding, header.uuid = old.global_encoding, old.uuid
             header.file_source_id = old.file_source_id
@@ -76,11 +83,25 @@ class Rewriter:
                 self._las.write_evlrs(laspy.vlrs.vlrlist.VLRList(self._evlrs))
             self._las.close()
 
-    def write(self, record: Any, moved_m: Array) -> Array:
+    def write(
+        self, record: Any, moved_m: Array | None = None, columns: Mapping[str, npt.NDArray[Any]] | None = None
+    ) -> Array:
         """Append points moved by so much, shape (n, 3); gives their map coordinates as stored.
 
         The whole number that a coordinate is stored as changes by the whole number of steps next to the move: no move, no change.
+
+        Parameters
+        ----------
+        record : laspy.ScaleAwarePointRecord
+            As read; changed.
+        moved_m : ndarray, shape (n, 3), optional
+        columns : mapping of str to ndarray, shape (n,), optional
+            Values of all attributes that were said to be added, in the unit of the table.
         """
+        assert set(columns or ()) == {entry.name for entry in self._added}, columns
+        if self._added:
+            record = self._with_columns(record, columns or {})
+        moved_m = np.zeros((len(record), 3)) if moved_m is None else moved_m
         places = np.empty((len(record), 3))
         for axis, name in enumerate("XYZ"):
             step, origin = float(record.scales[axis]), float(record.offsets[axis])
@@ -92,6 +113,39 @@ class Rewriter:
         with storing(self.path):
             self._las.write_points(record)
         return places
+
+    def _with_columns(self, record: Any, columns: Mapping[str, npt.NDArray[Any]]) -> Any:
+        """The points with room for more, and that filled."""
+        out = laspy.ScaleAwarePointRecord.zeros(
+            len(record), point_format=self._format, scales=record.scales, offsets=record.offsets
+        )
+        new = {entry.name for entry in self._added if not entry.field}
+        for name in record.array.dtype.names:
+            if name not in new:
+                out.array[name] = record.array[name]
+        for entry in self._added:
+            values = np.asarray(columns[entry.name])
+            if entry.field or entry.scale is None:
+                out[entry.field or entry.name] = values
+                continue
+            low, high = entry.steps()
+            steps = np.rint(values / entry.scale)
+            known = np.isfinite(steps)
+            stored = np.where(known, np.clip(steps, low, high), entry.no_data or 0)
+            out.array[entry.name] = stored.astype(entry.stored)
+        return out
+
+
+def _format(old: Any, added: Sequence[Dimension]) -> Any:
+    """The point format of a cloud with more extra bytes."""
+    new = laspy.PointFormat(old.id)
+    names = {entry.name for entry in added}
+    for each in old.extra_dimensions:
+        if each.name not in names:
+            new.dimensions.append(each)
+    for entry in added:
+        new.add_extra_dimension(extra_bytes(entry))
+    return new
 
 
 def _is_extra_bytes(record: Any) -> bool:

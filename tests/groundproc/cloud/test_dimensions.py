@@ -28,6 +28,8 @@ STANDARD = {
 
 def values_of(entry: Dimension, count: int) -> npt.NDArray[Any]:
     """Values over all that a column can hold, its ends among them."""
+    if entry.stored.kind == "f":
+        return np.linspace(-1e3, 1e3, count).astype(entry.column)
     low, high = entry.steps()
     steps = np.linspace(low, high, count).round().astype(np.int64)
     return (steps * (entry.scale or 1)).astype(entry.column)

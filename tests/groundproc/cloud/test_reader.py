@@ -82,6 +82,30 @@ def test_a_cloud_written_anew_keeps_what_the_table_does_not_know(tmp_path: Path)
         assert again.header.point_format == theirs.header.point_format
 
 
+@pytest.mark.parametrize("point_format", [1, 7])
+def test_a_cloud_written_anew_takes_more_attributes_and_replaces_those_of_the_same_name(
+    tmp_path: Path, point_format: int
+) -> None:
+    theirs = foreign(tmp_path / "a.laz", point_format)
+    cloud = look(tmp_path / "a.laz")
+    rng = np.random.default_rng(3)
+    given = {
+        "reflectance": rng.random(len(theirs)).astype(np.float32),
+        "azimuth": rng.integers(0, 36000, len(theirs)) * 0.01,
+        "classification": rng.integers(0, 20, len(theirs)).astype(np.uint8),
+    }
+    with Rewriter(cloud, tmp_path / "b.laz", added=given) as new:
+        for chunk in reader.chunks(cloud, columns=()):
+            new.write(chunk.record, columns=given)
+    again = laspy.read(tmp_path / "b.laz")
+    for name in set(theirs.points.array.dtype.names) - {"azimuth", "raw_classification", "classification"}:
+        assert (again.points.array[name] == theirs.points.array[name]).all()
+    assert (np.asarray(again.classification) == given["classification"]).all()
+    (chunk,) = reader.chunks(look(tmp_path / "b.laz"), columns=("reflectance", "azimuth"))
+    assert (chunk.points["reflectance"] == given["reflectance"]).all()
+    np.testing.assert_allclose(chunk.points["azimuth"], given["azimuth"], rtol=1e-6)
+
+
 def test_times_are_asked_for_and_not_there(tmp_path: Path) -> None:
     foreign(tmp_path / "a.laz", 2)
     cloud = look(tmp_path / "a.laz")
