@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--positions", type=Path, metavar="FILE",
-        help="positions of the kit's GNSS antenna (RTKLIB .pos, SBET, NMEA, or a table with utc_ns)",
+        help="positions of the kit's GNSS antenna (RTKLIB .pos, SBET, NMEA, TUM, KITTI, or a table with utc_ns)",
     )  # fmt: skip
     parser.add_argument("--mount", type=Path, metavar="YAML", help="how the lidar was mounted; goes into the log")
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="LOG.mcap", help="the log to write")

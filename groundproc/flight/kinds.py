@@ -11,7 +11,7 @@ from typing import Final
 from flightlog import dataflash
 from flightlog.container import MAGIC
 from groundproc.flight.importers import tlog
-from groundproc.flight.positions import rinex
+from groundproc.flight.positions import localposes, rinex
 from groundproc.flight.positions.nmea import looks_like_nmea
 from groundproc.flight.positions.poses import looks_like_poses
 from groundproc.flight.positions.rtklib import looks_like_pos
@@ -165,6 +165,7 @@ def _tests(head: bytes, size: int) -> tuple[tuple[Callable[[], bool], Kind], ...
         (lambda: looks_like_pos(text), SOLUTION),
         (lambda: _trims(text), TRIMS),
         (lambda: looks_like_poses(text), POSES),
+        (lambda: localposes.looks_like(text) != "", SOLUTION),
         (lambda: looks_like_nmea(head), SOLUTION),
         (lambda: not text and looks_like_sbet(head, size), SOLUTION),
         (lambda: not text and looks_like_accuracy(head, size), ACCURACY),

@@ -171,7 +171,7 @@ def read_estimate(folder: Path) -> Estimate:
         A file is missing or cannot be read as what it should be.
     """
     said = _read_report(folder / REPORT)
-    trajectory, changed = _read_trajectory(folder)
+    trajectory, changed = read_knots(folder)
     return Estimate(
         trajectory,
         load_mount(folder / MOUNT),
@@ -221,7 +221,7 @@ def _exact(trajectory: Trajectory, digest: str) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def _read_trajectory(folder: Path) -> tuple[Trajectory, bool]:
+def read_knots(folder: Path) -> tuple[Trajectory, bool]:
     """The trajectory, and whether trajectory.csv was changed since it was written."""
     path = folder / EXACT
     held = read_arrays(path)

@@ -79,11 +79,17 @@ def from_poses(
     """A trajectory through poses, shape (n, ...), with velocities and rates from their differences; steps over 1 s are gaps."""
     step_s = np.diff(time_ns) * 1e-9
     joined = np.diff(time_ns) <= LONGEST_STEP_NS
-    velocity = _at_knots(np.diff(position_m, axis=0) / step_s[:, None], step_s, joined)
+    velocity = slopes_at_knots(position_m, time_ns, joined)
     turn = frames.quat_log(frames.quat_multiply(frames.quat_inverse(quat[:-1]), quat[1:])) / step_s[:, None]
     rate = _at_knots(turn, step_s, joined)
     covered = np.append(joined, False)
     return Trajectory(frame, time_ns, position_m, velocity, quat, rate, sigma_position_m, sigma_rad, covered)
+
+
+def slopes_at_knots(values: Array, time_ns: npt.NDArray[np.int64], joined: npt.NDArray[np.bool_]) -> Array:
+    """Slopes of values at their times, shape (n, 3), [unit/s]; `joined`, shape (n - 1,): what follows each other without a gap."""
+    step_s = np.diff(time_ns) * 1e-9
+    return _at_knots(np.diff(values, axis=0) / step_s[:, None], step_s, joined)
 
 
 def _at_knots(slope: Array, step_s: Array, joined: npt.NDArray[np.bool_]) -> Array:

@@ -19,14 +19,14 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from flightlog import __version__, frames, records
 from flightlog.clock import utc_text
 from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US
-from flightlog.errors import CaptureError, UsageError
+from flightlog.errors import CaptureError, LogError, UsageError
 from flightlog.logfile import LogWriter
 from groundproc.files import written_aside
 from groundproc.flight.importers.joining import LogMessage
 from groundproc.flight.importers.lines import read_imu, read_lines
 from groundproc.flight.lidar import STATED
 from groundproc.flight.positions.reading import read_solution
-from groundproc.flight.positions.solution import ELLIPSOID, Solution
+from groundproc.flight.positions.solution import ELLIPSOID, MSL, Solution
 from groundproc.sensors.linescan import LIDAR
 
 Array = npt.NDArray[np.float64]
@@ -80,6 +80,10 @@ def import_kit(
     lines = read_lines(scans)
     time_ns, rate, force_m_s2 = read_imu(imu)
     solution = read_solution(positions, near_utc_ns=int(lines["time_ns"][0]))
+    if solution.height_reference not in (ELLIPSOID, MSL):
+        raise LogError(
+            f"{positions}: its heights are {solution.height_reference}, expected above the {ELLIPSOID} or above sea level ({MSL})"
+        )
     start_ns = min(int(time_ns[0]), int(solution.time_ns[0]))
     _check_overlap({scans: lines["time_ns"], imu: time_ns, positions: solution.time_ns})
     events = (_imu(time_ns, rate, force_m_s2, start_ns), _fixes(solution, start_ns))

@@ -163,24 +163,24 @@ def outside_fixes(
         left_out["thinned"] = len(chosen) - len(rows)
         chosen = chosen.rows(rows)
     height_m = _heights(chosen, height, undulation_m)
-    mat_frame_place = _mat_frame_place(frame, chosen)
+    mat_place = mat_frame_place(frame, chosen.latitude_deg, chosen.longitude_deg)
     velocity, attitude = chosen.velocity_m_s, chosen.quat_place_ins_wxyz
     turns, crossed = _rotation_covariance(chosen)
     return OutsideFixes(
         source=f"{chosen.source} ({chosen.format})",
         time_ns=chosen.time_ns,
         position_m=frame.from_geodetic(chosen.latitude_deg, chosen.longitude_deg, height_m),
-        covariance_m2=turned(mat_frame_place, _stated(chosen, sigma_m) * sigma_scale**2),
+        covariance_m2=turned(mat_place, _stated(chosen, sigma_m) * sigma_scale**2),
         lever_arm_m=np.asarray(lever_arm_m, np.float64),
         quality=chosen.quality,
-        velocity_m_s=None if velocity is None else np.einsum("nij,nj->ni", mat_frame_place, velocity),
-        velocity_covariance_m2_s2=_turned_if(mat_frame_place, chosen.velocity_covariance_m2_s2, sigma_scale),
+        velocity_m_s=None if velocity is None else np.einsum("nij,nj->ni", mat_place, velocity),
+        velocity_covariance_m2_s2=_turned_if(mat_place, chosen.velocity_covariance_m2_s2, sigma_scale),
         quat_local_ins_wxyz=None
         if attitude is None
-        else frames.quat_multiply(frames.quat_from_mat(mat_frame_place), attitude),
-        attitude_covariance_rad2=_turned_if(mat_frame_place, turns, sigma_scale),
+        else frames.quat_multiply(frames.quat_from_mat(mat_place), attitude),
+        attitude_covariance_rad2=_turned_if(mat_place, turns, sigma_scale),
         left_out=left_out,
-        cross_covariance_m_rad=_turned_if(mat_frame_place, crossed, sigma_scale),
+        cross_covariance_m_rad=_turned_if(mat_place, crossed, sigma_scale),
     )
 
 
@@ -188,7 +188,7 @@ def _heights(solution: Solution, height: str, undulation_m: float | None) -> Arr
     """Heights above the reference asked for [m], shape (n,)."""
     if height == solution.height_reference:
         return solution.height_m
-    if height not in (ELLIPSOID, MSL):
+    if height not in (ELLIPSOID, MSL) or solution.height_reference not in (ELLIPSOID, MSL):
         raise LogError(
             f"{solution.source}: heights {height!r} are asked for, but its own are above the {solution.height_reference}, expected "
             f"{ELLIPSOID} or {MSL}"
@@ -206,10 +206,10 @@ def _heights(solution: Solution, height: str, undulation_m: float | None) -> Arr
     return np.asarray(solution.height_m + sign * undulation_m)
 
 
-def _mat_frame_place(frame: LocalFrame, solution: Solution) -> Array:
+def mat_frame_place(frame: LocalFrame, latitude_deg: Array, longitude_deg: Array) -> Array:
     """Column matrices "axes of the frame from east, north, up at the place", shape (n, 3, 3): 0.01 deg for each kilometre."""
     mat_ecef_frame = mat_ecef_enu(np.array(frame.latitude_deg), np.array(frame.longitude_deg))
-    return np.asarray(mat_ecef_frame.T @ mat_ecef_enu(solution.latitude_deg, solution.longitude_deg))
+    return np.asarray(mat_ecef_frame.T @ mat_ecef_enu(latitude_deg, longitude_deg))
 
 
 def _stated(solution: Solution, sigma_m: Sequence[float] | None) -> Array:

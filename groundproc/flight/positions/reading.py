@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from flightlog.errors import LogError
+from groundproc.flight.positions import localposes
 from groundproc.flight.positions.nmea import looks_like_nmea, read_nmea
 from groundproc.flight.positions.poses import looks_like_poses, read_poses
 from groundproc.flight.positions.rinex import is_raw_observations
@@ -30,7 +31,7 @@ def read_solution(
     utc_seconds: bool = False,
     poses_height: str = ELLIPSOID,
 ) -> Solution:
-    """Read a solution, whatever its format: RTKLIB .pos, SBET, NMEA, or poses (trajectory.csv).
+    """Read a solution, whatever its format: RTKLIB .pos, SBET, NMEA, or poses (trajectory.csv, TUM, KITTI).
 
     Parameters
     ----------
@@ -58,13 +59,18 @@ def read_solution(
         return dated(read_pos(path), near_utc_ns)
     if looks_like_poses(text):
         return dated(read_poses(path, height_reference=poses_height), near_utc_ns)
+    if kind := localposes.looks_like(text):
+        read = localposes.read_tum if kind == localposes.TUM else localposes.read_kitti
+        return dated(read(path), near_utc_ns)
     if looks_like_nmea(head):
         return dated(read_nmea(path, near_utc_ns=near_utc_ns), near_utc_ns)
     if degrees := in_degrees(head, size):
         raise LogError(f"{path}: looks like an SBET, but its {degrees} {DEGREES_SENTENCE}")
     if looks_like_sbet(head, size):
         return read_sbet(path, near_utc_ns=near_utc_ns, week=week, accuracy=accuracy, utc_seconds=utc_seconds)
-    raise LogError(f"{path}: {_what_else(head, size)}, expected an RTKLIB .pos, an SBET, NMEA, or a table with utc_ns")
+    raise LogError(
+        f"{path}: {_what_else(head, size)}, expected an RTKLIB .pos, an SBET, NMEA, TUM, KITTI, or a table with utc_ns"
+    )
 
 
 def _what_else(head: bytes, size: int) -> str:

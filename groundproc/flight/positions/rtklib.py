@@ -22,7 +22,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
 from groundproc.flight.positions.ellipsoid import ecef_from_geodetic, geodetic_from_ecef, mat_ecef_enu, turned
 from groundproc.flight.positions.scales import gps_calendar_from_utc, utc_from_gps_calendar
-from groundproc.flight.positions.solution import ANTENNA, ELLIPSOID, MSL, Quality, Solution, symmetric, tidied
+from groundproc.flight.positions.solution import ANTENNA, ELLIPSOID, INS, MSL, Quality, Solution, symmetric, tidied
 from groundproc.text import decimal_comma, open_text
 
 Array = npt.NDArray[np.float64]
@@ -44,6 +44,8 @@ _FARTHEST_M: Final = 6.5e6
 """From the centre of the Earth."""
 _JST_AHEAD_S: Final = 9 * 3600
 _FORMAT: Final = "RTKLIB .pos"
+POINT_OF_INS: Final = "point     : origin of the ins frame"
+"""A line of the header of files that hold the way of the IMU, not that of an antenna."""
 
 
 @dataclass(slots=True)
@@ -61,6 +63,7 @@ class _Header:
     combined: bool = False
     ratio_threshold: float = math.inf
     program: str = ""
+    point: str = ANTENNA
 
 
 def looks_like_pos(head: str) -> bool:
@@ -99,7 +102,7 @@ def read_pos(path: Path) -> Solution:
     found = Solution(
         source=path.name,
         format=_FORMAT,
-        point=ANTENNA,
+        point=header.point,
         height_reference=MSL if header.geodetic else ELLIPSOID,
         sigma_source="RTKLIB's filter",
         time_ns=times,
@@ -196,6 +199,8 @@ def _header_line(line: str, header: _Header) -> None:
         header.ratio_threshold = _number(value)
     elif colon and label == "program":
         header.program = value
+    elif line[1:].strip() == POINT_OF_INS:
+        header.point = INS
 
 
 def _columns(found: re.Match[str], header: _Header) -> None:
@@ -350,19 +355,19 @@ def _velocity(header: _Header, table: Array, mat_place: Array | None) -> tuple[A
 
 
 _HEAD: Final = (
-    "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)\n"
+    "% (lat/lon/height=WGS84/{},Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)\n"
     "%  GPST                     latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
     "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio    vn(m/s)    ve(m/s)    vu(m/s)      sdvn     sdve     sdvu    sdvne    sdveu    sdvun\n"
 )
 
 
 def write_pos(file: TextIO, solution: Solution, comments: Iterable[str]) -> None:
-    """Write positions, GPS calendar and ellipsoidal heights, as RTKLIB does; `comments` are header lines such as "program : x"."""
+    """Write positions, GPS calendar and heights of its reference, as RTKLIB does; `comments` are header lines such as "program : x"."""
     assert solution.satellites is not None
     assert solution.age_s is not None
     assert solution.ratio is not None
     file.writelines(f"% {comment}\n" for comment in comments)
-    file.write("%\n" + _HEAD)
+    file.write("%\n" + _HEAD.format("ellipsoidal" if solution.height_reference == ELLIPSOID else "geodetic"))
     velocity, velocity_covariance = np.zeros((len(solution), 3)), np.zeros((len(solution), 3, 3))
     if solution.velocity_m_s is not None and solution.velocity_covariance_m2_s2 is not None:
         stated = np.isfinite(solution.velocity_m_s).all(axis=1)

@@ -37,7 +37,7 @@ _ACCURACY: Final = (
 )  # fmt: skip
 RECORD: Final = np.dtype([(name, "<f8") for name in _NAMES])
 ACCURACY_RECORD: Final = np.dtype([(name, "<f8") for name in _ACCURACY])
-_MINUTE_RAD: Final = np.pi / 180 / 60
+MINUTE_RAD: Final = np.pi / 180 / 60
 _LARGEST: Final = {
     "time": 1e11, "latitude": np.pi / 2, "longitude": 2 * np.pi, "altitude": 1e5, "x_velocity": 1e4, "y_velocity": 1e4,
     "z_velocity": 1e4, "roll": 7.0, "pitch": 7.0, "platform_heading": 7.0, "wander_angle": 7.0,
@@ -104,7 +104,8 @@ def looks_like_accuracy(head: bytes, size: int) -> bool:
     if records is None or not _rising(records["time"]):
         return False
     with np.errstate(invalid="ignore"):
-        return bool(all(((records[name] >= 0) & (records[name] < 1e5)).all() for name in _ACCURACY[1:]))
+        possible = ((records[name] >= 0) & (records[name] < 1e5) | np.isnan(records[name]) for name in _ACCURACY[1:])
+        return bool(all(good.all() for good in possible)) and bool(np.isfinite(records["north"]).any())
 
 
 def _whole(head: bytes, record: np.dtype[np.void], size: int) -> npt.NDArray[np.void] | None:
@@ -169,7 +170,7 @@ def read_sbet(
     speed, sign, note = _velocity(records)
     heading = records["platform_heading"] - sign * records["wander_angle"]
     quat = frames.quat_from_mat(frames.mat_local_ins(heading, records["pitch"], records["roll"]))
-    accuracy = accuracy or _beside(path)
+    accuracy = accuracy or _there(accuracy_beside(path))
     position, velocity, attitude = _covariances(calendar_ns, accuracy, path)
     return tidied(
         Solution(
@@ -236,12 +237,13 @@ def _of_weeks(
     return records, calendar_ns + round((near_ns - int(np.median(calendar_ns))) / WEEK_NS) * WEEK_NS
 
 
-def _beside(path: Path) -> Path | None:
-    """The accuracy file of the same run, where it has the usual name."""
-    if not path.name.lower().startswith("sbet"):
-        return None
-    other = path.with_name("smrmsg" + path.name[4:])
-    return other if other.is_file() else None
+def accuracy_beside(path: Path) -> Path | None:
+    """The usual name of the accuracy file of an SBET; None where that does not have the usual name itself."""
+    return path.with_name("smrmsg" + path.name[4:]) if path.name.lower().startswith("sbet") else None
+
+
+def _there(path: Path | None) -> Path | None:
+    return path if path is not None and path.is_file() else None
 
 
 def _covariances(calendar_ns: npt.NDArray[np.int64], accuracy: Path | None, path: Path) -> tuple[Array, Array, Array]:
@@ -265,7 +267,7 @@ def _covariances(calendar_ns: npt.NDArray[np.int64], accuracy: Path | None, path
         columns = (np.where(np.abs(records[name]) <= _LARGEST_SIGMA, records[name], np.nan) for name in names)
         return np.stack([np.interp(time_s, stated_s, column) for column in columns], axis=-1)
 
-    angle = at("roll", "pitch", "heading") * _MINUTE_RAD
+    angle = at("roll", "pitch", "heading") * MINUTE_RAD
     return (
         diagonal_covariance(at("east", "north", "down")),
         diagonal_covariance(at("east_velocity", "north_velocity", "down_velocity")),
