@@ -21,10 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly made-up flights through the real stages; what is compiled already is only loaded.
-
-    One after the other: numba's cache does not stand two processes that compile one kernel for two kinds of arrays.
-    """
+    """Fly made-up flights through the real stages; what is compiled already is only loaded."""
     from groundproc import kernelcache
     from groundproc.live.warmup import warm_up
     from groundproc.progress import compiling
