@@ -88,6 +88,17 @@ def load(path: str | Path, cls: type[T]) -> T:
     ConfigError
         The file cannot be read, is no YAML mapping, or holds an unknown key, a wrong type or a value out of range.
     """
+    return from_mapping(load_tree(path), cls, str(path))
+
+
+def load_tree(path: str | Path) -> Any:
+    """Read a YAML file whose keys are not known beforehand: lists, mappings and scalars as they stand there.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or is no YAML.
+    """
     try:
         with Path(path).open("rb") as file:
             data = file.read(LARGEST_BYTES + 1)
@@ -100,17 +111,21 @@ def load(path: str | Path, cls: type[T]) -> T:
         raise ConfigError(f"{str(path)!r}: is no name of a file") from None
     if len(data) > LARGEST_BYTES:
         raise ConfigError(f"{path}: is larger than {LARGEST_BYTES >> 10} KiB, which no configuration is")
-    return loads(text, cls, str(path))
+    return _tree(text, str(path))
 
 
 def loads(text: str, cls: type[T], place: str) -> T:
     """Read YAML text; `place` names it in errors. See `load`."""
+    return from_mapping(_tree(text, place), cls, place)
+
+
+def _tree(text: str, place: str) -> Any:
     try:
         tree = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:  # PyYAML lets the last three through
         reason = " ".join(str(error).split())
         raise ConfigError(f"{place}: is not valid YAML ({reason})") from None
-    return from_mapping({} if tree is None else tree, cls, place)
+    return {} if tree is None else tree
 
 
 def from_mapping(tree: Any, cls: type[T], place: str) -> T:
