@@ -42,17 +42,16 @@ def judged(folder: Path, survey: Survey) -> tuple[Estimate, Judgement]:
 def test_over_a_meadow_trees_and_tufts_hold_the_path(meadow: Any) -> None:
     """It was lost here by metres: noisy normals of the ground braked the take-off, and what is no plane counted for nothing.
 
-    The batch still has the ground alone: in the three seconds of hover, before the trees have been seen from elsewhere, the smoother's
-    inertial data hold it to decimetres.
+    The batch, which had the ground alone, bent the three seconds of hover by 0.4 m: trees and tufts hold it too.
     """
     made, found = judged(meadow.folder, Survey(method="adjusted"))
     _, smoothed = judged(meadow.folder, Survey(method="filtered"))
     assert made.report["restarts"] == 0
     assert made.report["blind_s"] <= 1.0  # while the map is young
     assert made.warning == ""
-    assert found.figures["ate_m"] <= 0.15
-    assert found.figures["ate_m"] <= 0.5 * smoothed.figures["ate_m"]
-    assert found.figures["rotation_rms_free_deg"] <= 0.06
+    assert found.figures["ate_m"] <= 0.03
+    assert found.figures["ate_m"] <= 0.1 * smoothed.figures["ate_m"]
+    assert found.figures["rotation_rms_free_deg"] <= 0.045
     assert found.figures["position_within_2_sigma"] >= 0.95
     assert np.isfinite(made.trajectory.sigma_position_m).all()
 

@@ -1,4 +1,4 @@
-"""What the lidar sees, as an observation: planes of voxels, solved for within, and the corrections of the single lasers.
+"""What the lidar sees, as an observation: planes of voxels and what fills them, solved for within; corrections of the single lasers.
 
 Its rows are hundreds of thousands and touch each other all over the flight, so they are no `Factor`: the engine asks for them as
 `planes.Rows`, which are applied and never written down. All else, the unknowns, the solution and the self-check, is as for the others.
@@ -24,7 +24,9 @@ DEFLATION: Final = 4.0
 """The lidar's information is divided by this: errors of neighbouring clusters are not independent. Checked by the share of errors within
 two sigmas (tests)."""
 MOST: Final = 1000
-"""Rows of a slice, at most."""
+"""Rows of a slice on planes, at most."""
+MOST_FILLED: Final = 300
+"""Clusters of a slice on leaves and blades, at most: each has three rows."""
 WORSE: Final = 2.0
 """Residuals so many times what their noise explains are worth a warning."""
 
@@ -56,7 +58,7 @@ class Lidar(Observation):
 
     def rows(self, path: Path, voxel_m: float, cut: bool) -> Rows:
         """Distances from planes, linear about a path; voxels have edges of `voxel_m`, outliers are `cut` or only weigh less."""
-        return rows_of(self.clusters, path, voxel_m, MOST, cut)
+        return rows_of(self.clusters, path, voxel_m, MOST, cut, MOST_FILLED)
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """None: see `rows`."""

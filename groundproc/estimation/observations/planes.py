@@ -6,12 +6,12 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.ndimage import uniform_filter1d
 
+from groundproc.estimation.observations.filled import filled_rows
 from groundproc.estimation.observations.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
+from groundproc.estimation.observations.told import Poses, keep_told
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
-from groundproc.estimation.odometry.matching import GROUND, observable
 from groundproc.estimation.odometry.spline import Path, PathArrays
 from groundproc.numerics.planerows import PlaneRows, RowArrays
 from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
@@ -28,12 +28,6 @@ RANGE_SIGMA_M: Final = 0.02
 """Noise of a return (data sheet); what a voxel's own residuals show comes on top."""
 ROUGHNESS_M: Final = 0.006
 """Roughness of a surface before its residuals tell, one sigma of a cluster [m]."""
-GROUND_SLICES: Final = 201
-"""Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
-FLAT: Final = 1e-3
-"""Share of a slice's information below which a direction counts as not observed."""
-SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
-"""What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
 
 
 @dataclass(slots=True)
@@ -86,8 +80,8 @@ class Rows(PlaneRows):
         self.lasers = lasers
 
 
-def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool) -> Rows:
-    """Put clusters into voxels where the path places them, find the planes, and linearise.
+def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool, filled: int = 0) -> Rows:
+    """Put clusters into voxels where the path places them, find the planes and what fills its voxel instead, and linearise.
 
     Parameters
     ----------
@@ -98,6 +92,8 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
         Rows of a slice; what has more is thinned, planes of rare direction last.
     cut : bool
         Whether rows beyond `CUT` sigmas are dropped: not while the path is still rough.
+    filled : int
+        Clusters of a slice on what fills its voxel that are used.
     """
     world, rotation, knot, weights = _place_all(clusters, path)
     voxel, voxels = assign(world, voxel_m)
@@ -109,21 +105,25 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     kept = order[keep]
     good = np.repeat(np.arange(voxels), np.diff(first))[keep]
     ids, at = np.unique(good, return_index=True)
-    starts = np.append(at, len(good)).astype(np.int64)
+    leaves = filled_rows(first, order, seen, voxel_m, planes.good, path.intervals, filled)
+    flat = len(kept)
+    kept = np.concatenate([kept, leaves.cluster])
+    starts = np.concatenate([at, flat + leaves.first]).astype(np.int64)
     n = len(kept)
     rows = Rows(
         starts, knot[kept], weights[kept], np.empty((n, 6), np.float32), np.empty((n, 2), np.float32), np.empty(n), np.empty(n),
-        np.empty((len(ids), 6)), kept, path.intervals,
+        np.empty((len(starts) - 1, 6)), kept, path.intervals,
     )  # fmt: skip
-    normals, variance = planes.normal[ids], np.empty(n)
-    poses = _Poses(rotation, clusters.xyz_m)
-    chosen = VoxelPlanes(normals, planes.mean_m[ids], planes.good[ids])
-    rows.lay(kept, seen, chosen, voxel_m)
+    normals, variance = np.concatenate([planes.normal[ids], leaves.axis]), np.empty(n)
+    poses = Poses(rotation, clusters.xyz_m)
+    means = np.concatenate([planes.mean_m[ids], leaves.mean_m])
+    rows.lay(kept, seen, VoxelPlanes(normals, means, np.ones(len(means), np.bool_)), voxel_m)
     _linearise(rows.arrays, kept, seen, poses, normals, variance)
+    rows.plane[flat:], variance[flat:] = 0.0, leaves.variance_m2  # they have no tilts
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
     rotation, xyz = rotation[kept], clusters.xyz_m[kept]
-    del world, knot, weights, voxel, order, good, keep, seen, poses, variance  # a hundred bytes a cluster
-    _drop_unobserved(rows, _Poses(rotation, xyz), voxel_m)
+    del world, knot, weights, voxel, order, good, keep, seen, poses, variance, leaves  # a hundred bytes a cluster
+    keep_told(rows, Poses(rotation, xyz), flat, voxel_m)
     if clusters.laser is not None:
         in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
         rows.with_lasers(clusters.laser[kept], xyz, in_sensor)
@@ -161,98 +161,6 @@ def _place_all(clusters: Clusters, path: Path) -> _Located:
     )  # fmt: skip
     _place(clusters.time_ns, clusters.xyz_m, path.arrays, out)
     return out
-
-
-class _Poses(NamedTuple):
-    """Clusters in the sensor frame, and its attitudes.
-
-    Attributes
-    ----------
-    rotation : ndarray of float32, shape (n, 9)
-        Local from sensor, row by row.
-    xyz_m : ndarray of float32, shape (n, 3)
-    """
-
-    rotation: Singles
-    xyz_m: Singles
-
-
-def _drop_unobserved(rows: Rows, poses: _Poses, voxel_m: float) -> None:
-    """Take out of the rows of each interval the directions that its planes do not show, as the odometry does.
-
-    Judged and taken out on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it,
-    and each change of tilt would seem to tell a little of the heading. Where the heading is not seen at all, tilts count no more than
-    the shape of the path between two knots is known: a gyro's offset about the vertical shows in them by the small part that a body
-    leans, and what is far below that noise would settle it wrongly. The poses are those of the rows' clusters.
-    """
-    normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
-    _sum_ground(rows.knot, rows.jacobian, rows.weight, normals)
-    normals = uniform_filter1d(normals, GROUND_SLICES, axis=0, mode="constant")
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    _level(rows.knot, rows.jacobian, poses, normals, level)
-    blocks = np.zeros((rows.intervals, 6, 6))
-    _blocks(rows.knot, level, rows.weight, blocks)
-    known = np.array([observable(block, FLAT) if block[3:, 3:].any() else np.eye(6) for block in blocks])
-    affected = np.trace(known, axis1=1, axis2=2) < 5.5
-    _keep_known(rows.arrays, affected, known, level, poses.rotation)
-    blind = affected & (known[:, 2, 2] < 0.5)
-    if blind.any():
-        share = np.ones(rows.intervals)
-        share[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(blocks[blind, :3, :3])[:, 2])
-        rows.weight *= share[rows.knot]
-        rows.replane(voxel_m)
-
-
-@njit(cache=True, nogil=True)
-def _sum_ground(knot: Knots, jacobian: Singles, weight: Array, normals: Array) -> None:
-    """Weighted sum of the ground's normals in each interval, up."""
-    for i in range(len(knot)):
-        if abs(jacobian[i, 5]) > GROUND:
-            signed = weight[i] if jacobian[i, 5] > 0.0 else -weight[i]
-            for c in range(3):
-                normals[knot[i], c] += signed * jacobian[i, 3 + c]
-
-
-@njit(cache=True, nogil=True)
-def _level(knot: Knots, jacobian: Singles, poses: _Poses, normals: Array, out: Singles) -> None:
-    """Rows by rotation about the map's axes and by position, those of ground with the ground's mean normal."""
-    rotation, xyz = poses.rotation, poses.xyz_m
-    for i in range(len(jacobian)):
-        m, j = rotation[i], jacobian[i]
-        if abs(j[5]) > GROUND:
-            side = 1.0 if j[5] > 0.0 else -1.0
-            n = normals[knot[i]]
-            nx, ny, nz = side * n[0], side * n[1], side * n[2]
-            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
-            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
-            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
-            out[i, 0], out[i, 1], out[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-            out[i, 3], out[i, 4], out[i, 5] = nx, ny, nz
-        else:
-            for r in range(3):
-                out[i, r] = m[3 * r] * j[0] + m[3 * r + 1] * j[1] + m[3 * r + 2] * j[2]
-                out[i, 3 + r] = j[3 + r]
-
-
-@njit(cache=True, nogil=True)
-def _keep_known(
-    rows: RowArrays, affected: npt.NDArray[np.bool_], known: Array, level: Singles, rotation: Singles
-) -> None:
-    """Rows of the affected intervals anew: what is known of them, by rotation in the body again."""
-    knot, jacobian = rows.knot, rows.jacobian
-    row = np.empty(6)
-    for i in range(len(knot)):
-        k = knot[i]
-        if not affected[k]:
-            continue
-        row[:] = 0.0
-        for a in range(6):
-            for b in range(6):
-                row[b] += level[i, a] * known[k, a, b]
-        m = rotation[i]
-        for c in range(3):
-            jacobian[i, c] = m[c] * row[0] + m[3 + c] * row[1] + m[6 + c] * row[2]
-            jacobian[i, 3 + c] = row[3 + c]
 
 
 @njit(cache=True, nogil=True)
@@ -340,7 +248,7 @@ def _choose(first: Ints, order: Ints, knot: Knots, planes: VoxelPlanes, interval
 
 
 @njit(cache=True, nogil=True)
-def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: _Poses, normals: Array, variance: Array) -> None:
+def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: Poses, normals: Array, variance: Array) -> None:
     """Fill in jacobians of rows, and the variance of each by its returns [m^2].
 
     `kept` has the cluster of each row, `normals` are those of the voxels that the rows have.
@@ -361,13 +269,3 @@ def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: _Poses, normals
             # returns of one cluster spread across the plane more than their noise: two surfaces, or an edge
             across = scatter_along(scatter[n], nx, ny, nz) / counts[n]
             variance[i] = max(RANGE_SIGMA_M**2, across) / counts[n]
-
-
-@njit(cache=True, nogil=True)
-def _blocks(knot: Knots, jacobian: Singles, weight: Array, out: Array) -> None:
-    for i in range(len(knot)):
-        k = knot[i]
-        for a in range(6):
-            wa = weight[i] * jacobian[i, a]
-            for b in range(6):
-                out[k, a, b] += wa * jacobian[i, b]

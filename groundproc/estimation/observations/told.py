@@ -1,0 +1,162 @@
+"""What rows of the lidar really tell of the path, interval by interval: judged as in the odometry (`matching`), and taken into the rows.
+
+Normals of flat ground have errors, and thousands of them together would seem to hold the place along it. So the ground counts by the mean
+normal of some twenty seconds; what its own normals tell beyond that, the relief, counts for no more than all else tells, direction by
+direction; and a direction that nothing tells is left to inertial data and fixes.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.ndimage import uniform_filter1d
+
+from groundproc.estimation.odometry.matching import GROUND, INFLATION, RELIEF, TELLS_M, observable
+from groundproc.numerics.planerows import PlaneRows, RowArrays
+
+Array = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Knots = npt.NDArray[np.int32]
+
+GROUND_SLICES: Final = 201
+"""Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
+SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
+"""What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
+TOLD: Final = 5.5
+"""Trace of a projection below which a direction is missing: it has one for each of the six that are there."""
+
+
+class Poses(NamedTuple):
+    """Clusters in the sensor frame, and its attitudes.
+
+    Attributes
+    ----------
+    rotation : ndarray of float32, shape (n, 9)
+        Local from sensor, row by row.
+    xyz_m : ndarray of float32, shape (n, 3)
+    """
+
+    rotation: Singles
+    xyz_m: Singles
+
+
+def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float) -> None:
+    """Leave in the rows of each interval what they really tell.
+
+    Judged on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it, and each change
+    of tilt would seem to tell a little of the heading. Where the heading is not seen at all, tilts count no more than the shape of the
+    path between two knots is known: a gyro's offset about the vertical shows in them by the small part that a body leans, and what is
+    far below that noise would settle it wrongly.
+
+    Parameters
+    ----------
+    rows : PlaneRows
+    poses : Poses
+        Of the rows' clusters.
+    flat : int
+        So many rows are of planes, those after them of what fills its voxel.
+    voxel_m : float
+    """
+    normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
+    _sum_ground(rows.knot[:flat], rows.jacobian, rows.weight, normals)
+    normals = uniform_filter1d(normals, GROUND_SLICES, axis=0, mode="constant")
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    relief = np.zeros_like(rows.jacobian[:flat])
+    _level(rows.knot, rows.jacobian, poses, normals, level, relief)
+    base, more = np.zeros((2, rows.intervals, 6, 6))
+    _blocks(rows.knot, level, rows.weight, base)
+    _blocks(rows.knot[:flat], relief, rows.weight, more)
+    size = np.trace(base[:, 3:, 3:], axis1=1, axis2=2)
+    least = INFLATION * TELLS_M**-2 / np.maximum(size, 1e-12)
+    known = np.array([observable(*each) if each[0].any() else np.eye(6) for each in zip(base, least, strict=True)])
+    affected = np.trace(known, axis1=1, axis2=2) < TOLD
+    share = shares_of_relief(base, more)
+    share[affected] = 0.0
+    _take(rows.arrays, (known, share), (level, relief), poses.rotation)
+    blind = affected & (known[:, 2, 2] < 0.5)
+    if blind.any():
+        weaker = np.ones(rows.intervals)
+        weaker[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(base[blind, :3, :3])[:, 2])
+        rows.weight *= weaker[rows.knot]
+        rows.replane(voxel_m)
+
+
+def shares_of_relief(base: Array, relief: Array) -> Array:
+    """Matrices that take rows of the relief to what of them counts, shape (n, 6, 6).
+
+    Parameters
+    ----------
+    base, relief : ndarray, shape (n, 6, 6)
+        Information of all else, and of the relief; with the matrix M that is returned, M^T relief M is at most `RELIEF` times the former.
+    """
+    value, vector = np.linalg.eigh(base)
+    half = np.sqrt(np.maximum(value, 1e-13 * value[:, -1:] + 1e-12))[:, None, :]
+    narrow, wide = vector / half, vector * half
+    share, axes = np.linalg.eigh(np.swapaxes(narrow, 1, 2) @ relief @ narrow)
+    kept = np.sqrt(np.minimum(1.0, RELIEF / np.maximum(share, 1e-9)))[:, None, :]
+    return np.asarray((narrow @ axes * kept) @ np.swapaxes(wide @ axes, 1, 2))
+
+
+@njit(cache=True, nogil=True)
+def _sum_ground(knot: Knots, jacobian: Singles, weight: Array, normals: Array) -> None:
+    """Weighted sum of the ground's normals in each interval, up."""
+    for i in range(len(knot)):
+        if abs(jacobian[i, 5]) > GROUND:
+            signed = weight[i] if jacobian[i, 5] > 0.0 else -weight[i]
+            for c in range(3):
+                normals[knot[i], c] += signed * jacobian[i, 3 + c]
+
+
+@njit(cache=True, nogil=True)
+def _level(knot: Knots, jacobian: Singles, poses: Poses, normals: Array, out: Singles, relief: Singles) -> None:
+    """Rows by rotation about the map's axes and by position, those of ground with its mean normal; and what their own has beyond that."""
+    rotation, xyz = poses.rotation, poses.xyz_m
+    for i in range(len(jacobian)):
+        m, j = rotation[i], jacobian[i]
+        for r in range(3):
+            out[i, r] = m[3 * r] * j[0] + m[3 * r + 1] * j[1] + m[3 * r + 2] * j[2]
+            out[i, 3 + r] = j[3 + r]
+        if i < len(relief) and abs(j[5]) > GROUND:
+            relief[i] = out[i]
+            side = 1.0 if j[5] > 0.0 else -1.0
+            n = normals[knot[i]]
+            nx, ny, nz = side * n[0], side * n[1], side * n[2]
+            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
+            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
+            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
+            out[i, 0], out[i, 1], out[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+            out[i, 3], out[i, 4], out[i, 5] = nx, ny, nz
+            for c in range(6):
+                relief[i, c] -= out[i, c]
+
+
+@njit(cache=True, nogil=True)
+def _take(rows: RowArrays, kept: tuple[Array, Array], parts: tuple[Singles, Singles], rotation: Singles) -> None:
+    """Rows anew, of what is kept of both their parts, by rotation in the body again."""
+    knot, jacobian = rows.knot, rows.jacobian
+    (known, share), (level, relief) = kept, parts
+    row = np.empty(6)
+    for i in range(len(knot)):
+        k = knot[i]
+        row[:] = 0.0
+        for a in range(6):
+            for b in range(6):
+                row[b] += level[i, a] * known[k, a, b]
+                if i < len(relief):
+                    row[b] += relief[i, a] * share[k, a, b]
+        m = rotation[i]
+        for c in range(3):
+            jacobian[i, c] = m[c] * row[0] + m[3 + c] * row[1] + m[6 + c] * row[2]
+            jacobian[i, 3 + c] = row[3 + c]
+
+
+@njit(cache=True, nogil=True)
+def _blocks(knot: Knots, jacobian: Any, weight: Array, out: Array) -> None:
+    """Information of the rows of each interval."""
+    for i in range(len(knot)):
+        k = knot[i]
+        for a in range(6):
+            wa = weight[i] * jacobian[i, a]
+            for b in range(6):
+                out[k, a, b] += wa * jacobian[i, b]
