@@ -114,7 +114,7 @@ class RecorderStatus:
     trouble: str = ""
     """Why nothing is recorded, or where it is recorded instead."""
     abandoned: int = 0
-    """Segments that were deleted while they were written, or on a disk that failed."""
+    """Segments that were deleted or moved while they were written, or on a disk that failed."""
     leftovers: int = 0
     """Logs that a power cut or a crash had left open, found at the start."""
     leftovers_mended: int = 0
@@ -316,7 +316,8 @@ def _judge_recorder(recorder: RecorderStatus) -> list[tuple[Level, str]]:
         return [
             (
                 Level.WARNING,
-                f"recorder: {recorder.abandoned} segments were deleted while they were written, or their disk failed; see the journal",
+                f"recorder: {recorder.abandoned} segments were deleted or moved while they were written, or their disk failed; see "
+                "the journal",
             )
         ]
     if recorder.leftovers_left:

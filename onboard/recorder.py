@@ -1,6 +1,6 @@
 """The flight log's writer: a bounded backlog on which no receiver waits, and segments synced to disk twice a second.
 
-A segment that somebody deleted, a folder that is gone, a disk that fails or turns read-only: the segment is given up,
+A segment that somebody deleted or moved, a folder that is gone, a disk that fails or turns read-only: the segment is given up,
 and recording begins anew, in another folder if the configuration names one. Data that arrive meanwhile wait in the
 backlog.
 
@@ -26,7 +26,7 @@ from onboard import logfolder
 from onboard.config import RecorderConfig
 from onboard.journal import event
 from onboard.logfolder import Space
-from onboard.segment import Segment
+from onboard.segment import Segment, Where
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ class RecorderCounts:
     trouble: str = ""
     """Why nothing is recorded, or where it is recorded instead."""
     abandoned: int = 0
-    """Segments that were given up because they were deleted or the disk failed."""
+    """Segments that were given up because they were deleted or moved, or the disk failed."""
 
 
 class Recorder(Worker):
@@ -208,8 +208,7 @@ class Recorder(Worker):
             return
         self._sync_soon = False
         self._until_full(self._sync)
-        if self._segment is not None and self._segment.is_deleted:
-            self._abandon(f"{self._segment.path} was deleted while it was being written: what was in it is lost")
+        self._look_at_names()
         self._look_at_space()
         if self.counts.space is Space.FULL:
             self._close_segment()
@@ -322,6 +321,21 @@ class Recorder(Worker):
         elif self.counts.trouble:
             _log.warning("recording again, to %s", self._segment.path, extra=event("recording"))
             self.counts.trouble = ""
+
+    def _look_at_names(self) -> None:
+        """Give up a segment that somebody deleted or moved: nobody would look for what is written to it."""
+        segment = self._segment
+        where = Where.HERE if segment is None else segment.where
+        if segment is None or where is Where.HERE:
+            return
+        if where is Where.NOWHERE:
+            self._abandon(f"{segment.path} was deleted while it was being written: what was in it is lost")
+            return
+        with contextlib.suppress(OSError):
+            segment.part()
+        self._abandon(
+            f"{segment.path} was moved while it was being written: it ends where it is now, and is not in the manifest"
+        )
 
     def _tell_trouble(self, sentence: str) -> None:
         if sentence != self.counts.trouble:

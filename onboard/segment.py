@@ -1,6 +1,7 @@
 """One file of the flight log, from its first synced byte to its line in the manifest."""
 
 import contextlib
+import enum
 import fcntl
 import hashlib
 import os
@@ -22,6 +23,16 @@ _CHUNK_BYTES: Final = 3 << 19
 
 _IOV_MAX: Final = 1024
 """The kernel takes no more pieces in one call."""
+
+
+class Where(enum.Enum):
+    """Where a file is that is being written."""
+
+    HERE = enum.auto()
+    ELSEWHERE = enum.auto()
+    """Moved or renamed: its name leads to nothing, or to another file."""
+    NOWHERE = enum.auto()
+    """Deleted: nobody can reach it by a name any more."""
 
 
 class _HashedFile:
@@ -72,9 +83,18 @@ class _HashedFile:
         os.fdatasync(self._raw.fileno())
 
     @property
-    def is_deleted(self) -> bool:
-        """Whether nobody can reach it by a name any more."""
-        return os.fstat(self._raw.fileno()).st_nlink == 0
+    def where(self) -> Where:
+        """Whether its name still leads to it."""
+        own = os.fstat(self._raw.fileno())
+        if own.st_nlink == 0:
+            return Where.NOWHERE
+        try:
+            named = self._path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return Where.ELSEWHERE
+        except OSError:  # a disk that fails is told by the writing
+            return Where.HERE
+        return Where.HERE if os.path.samestat(own, named) else Where.ELSEWHERE
 
     def finish(self) -> str:
         """Sync, make read-only, close; gives the SHA-256."""
@@ -148,13 +168,20 @@ class Segment:
         return self._file.size
 
     @property
-    def is_deleted(self) -> bool:
-        """Whether somebody deleted the file: what is written to it is lost."""
-        return self._file.is_deleted
+    def where(self) -> Where:
+        """Whether somebody deleted or moved the file."""
+        return self._file.where
 
     def abandon(self) -> None:
         """Let go of a file that cannot be closed well; the next start mends it, if it is still there."""
         self._file.close()
+
+    def part(self) -> None:
+        """Make whole what was moved elsewhere, and let go of it: it is in no folder of ours any more."""
+        try:
+            self._writer.finish()
+        finally:
+            self._file.close()
 
     @property
     def age_s(self) -> float:

@@ -80,6 +80,28 @@ def test_a_deleted_segment_is_noticed_and_recording_goes_on_in_a_new_one(
     assert recorder.counts.trouble == ""
 
 
+@pytest.mark.parametrize("what", ["segment", "folder"])
+def test_a_segment_that_is_moved_ends_there_and_recording_goes_on_where_people_look(
+    tmp_path: Path, start: Callable[..., Recorder], what: str
+) -> None:
+    folder = tmp_path / "logs"
+    recorder = start(folder)
+    put(recorder, 1)
+    until(lambda: recorder.counts.messages == 1)
+    name = recorder.counts.segment
+    here, there = (folder / name, folder / "mine.mcap") if what == "segment" else (folder, tmp_path / "moved")
+    here.rename(there)
+    until(lambda: recorder.counts.segments == 2)
+    assert recorder.counts.abandoned == 1
+    put(recorder, 2)
+    recorder.stop()
+    (name_after,) = read_manifest(folder)
+    assert stamps(folder / name_after) == [2]
+    with LogReader(there if what == "segment" else there / name) as log:
+        assert not log.damage.truncated
+        assert [message.log_time_ns for message in log.messages(("/mavlink/ins",))] == [1]
+
+
 def test_a_folder_that_is_removed_is_made_again(tmp_path: Path, start: Callable[..., Recorder]) -> None:
     folder = tmp_path / "logs"
     recorder = start(folder)
