@@ -19,6 +19,7 @@ Address = tuple[int, int]
 
 SILENT_NS: Final = 3 * NS_PER_S
 """Who was not heard for so long is silent, and what he said of being armed holds no more."""
+_NEVER_NS: Final = -(1 << 63)
 MOST_SENDERS: Final = 64
 """Senders that are kept track of; a stranger who makes up addresses fills no memory."""
 
@@ -65,6 +66,8 @@ class Sender:
         What its newest heartbeat said; None before the first.
     armed_ns : int
         When [ns].
+    changes_ns : tuple of two int
+        When it last said otherwise than before, and the time before that [ns].
     """
 
     first_ns: int
@@ -76,11 +79,16 @@ class Sender:
     is_other: bool = False
     armed: bool | None = None
     armed_ns: int = 0
+    changes_ns: tuple[int, int] = (_NEVER_NS, _NEVER_NS)
 
     @property
     def is_vehicle(self) -> bool:
         """Whether it may be an autopilot."""
         return not self.is_other and (self.heartbeats > 0 or self.evidence > 0)
+
+    def may_be_armed(self, now_ns: int) -> bool:
+        """Whether it says so, or says both in turn: two vehicles may share its id, and one of them is armed."""
+        return bool(self.armed) or now_ns - self.changes_ns[1] <= SILENT_NS
 
     def hear(self, frame: Frame) -> None:
         """Take a verified frame of this sender."""
@@ -94,7 +102,10 @@ class Sender:
             if not self.is_other:
                 self.heartbeats += 1
                 self.version = frame.version
-                self.armed = bool(beat[_BASE_MODE] & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+                armed = bool(beat[_BASE_MODE] & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+                if self.armed is not None and armed is not self.armed:
+                    self.changes_ns = frame.time_ns, self.changes_ns[0]
+                self.armed = armed
                 self.armed_ns = frame.time_ns
 
 
@@ -164,7 +175,7 @@ class Vehicles:
         Only its own autopilot is believed when it says disarmed.
         """
         lately = {a: s for a, s in self.senders.items() if s.is_vehicle and now_ns - s.armed_ns <= SILENT_NS}
-        if any(sender.armed for sender in lately.values()):
+        if any(sender.may_be_armed(now_ns) for sender in lately.values()):
             return True
         own = lately.get(self.autopilot) if self.autopilot is not None else None
         return None if own is None else own.armed

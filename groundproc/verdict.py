@@ -173,16 +173,16 @@ def _log_lidar(summary: Figures) -> Iterator[Reason]:
         grade = DOUBTFUL if _has_autopilot(summary) else BAD
         yield Reason(grade, "lidar", "no lidar packets in the log, so that there are no points")
         return
-    account = lidar["account"] or {}
-    dropped = account.get("kernel_drops", 0) + account.get("queue_drops", 0)
-    lost = max(lidar["lost_packets"], dropped)
-    share = _share(lost, lost + lidar["packets"])
+    yield from _lost_packets(lidar["lost_packets"], lidar["packets"], lidar["account"] or {})
+
+
+def _lost_packets(missing: int, packets: int, account: Mapping[str, int]) -> Iterator[Reason]:
+    """`missing`: packets that the stamps tell of; `account`: what the recorder says, where there was one."""
+    lost = max(missing, account.get("kernel_drops", 0) + account.get("queue_drops", 0))
+    share = _share(lost, lost + packets)
     if share > LOST_PACKETS:
-        yield Reason(
-            DOUBTFUL,
-            "lost_packets",
-            f"{lost:,} lidar packets lost, {_percent(share)} of them (under {LOST_PACKETS:.0%} is usual)",
-        )
+        text = f"{lost:,} lidar packets lost, {_percent(share)} of them (under {LOST_PACKETS:.0%} is usual)"
+        yield Reason(DOUBTFUL, "lost_packets", text)
 
 
 def _has_lidar(summary: Figures) -> bool:
@@ -211,7 +211,14 @@ def _log_autopilot(summary: Figures) -> Iterator[Reason]:
         return
     sent = sum(message["count"] for message in link["messages"])
     share = _share(link["lost_frames"], link["lost_frames"] + sent)
-    if share > LOST_FRAMES:
+    if link["shared_ids"]:
+        names = " and ".join(link["shared_ids"])
+        yield Reason(
+            DOUBTFUL,
+            "shared_id",
+            f"several vehicles share the MAVLink id {names}, so that nobody can tell what was lost",
+        )
+    elif share > LOST_FRAMES:
         yield Reason(DOUBTFUL, "lost_frames", f"{_percent(share)} of the autopilot's messages were lost on the way")
     yield from _unreadable(link["bad_bytes"], link["frames"])
     if link["gps_fix_type"] is not None and link["gps_fix_type"] < 3:
@@ -340,10 +347,7 @@ def _points(quality: Figures) -> Iterator[Reason]:
     without = 1.0 - (1.0 - outside) * (1.0 - _share(dropped["no_pose"], shots))
     if without > WITHOUT_POSE:
         yield Reason(DOUBTFUL, "no_pose", f"{_percent(without)} of the lidar's shots have no pose and are left out")
-    lost = lidar["aboard"]["kernel_drops"] + lidar["aboard"]["queue_drops"]
-    share = _share(lost, lost + lidar["packets"])
-    if share > LOST_PACKETS:
-        yield Reason(DOUBTFUL, "lost_packets", f"{lost:,} lidar packets were lost aboard, {_percent(share)} of them")
+    yield from _lost_packets(lidar["lost_packets"], lidar["packets"], lidar["aboard"])
 
 
 FLIGHT_RULES: Final[tuple[Rule, ...]] = (_inputs, _clocks, _autopilot, _trajectory, _mount, _points)

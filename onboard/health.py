@@ -316,8 +316,7 @@ def _judge_recorder(recorder: RecorderStatus) -> list[tuple[Level, str]]:
         return [
             (
                 Level.WARNING,
-                f"recorder: {recorder.abandoned} segments were deleted or moved while they were written, or their disk failed; see "
-                "the journal",
+                f"recorder: {recorder.abandoned} segments were deleted, moved, or on a disk that failed; see the journal",
             )
         ]
     if recorder.leftovers_left:

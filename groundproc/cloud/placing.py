@@ -77,13 +77,23 @@ def place(
                 sink.add(points)
         del some, points  # the next piece takes their memory
     if not count:
-        raise CoverageError(
-            f"not one shot gives a point: the trajectory covers {utc_text(int(trajectory.time_ns[0]))} to "
-            f"{utc_text(int(trajectory.time_ns[-1]))}, and {dropped.no_pose} shots lie outside it"
-        )
+        raise CoverageError(f"not one shot gives a point: {_why_nothing(dropped, trajectory)}")
     for sink in sinks:
         sink.finish()
     return Placed(count, dropped)
+
+
+def _why_nothing(dropped: Dropped, trajectory: Trajectory) -> str:
+    """What became of all shots."""
+    if dropped.no_pose:
+        return (
+            f"the trajectory covers {utc_text(int(trajectory.time_ns[0]))} to {utc_text(int(trajectory.time_ns[-1]))}, and "
+            f"{dropped.no_pose:,} shots lie outside it"
+        )
+    return (
+        f"{dropped.outside_fov:,} lie outside the field of view (fov), {dropped.out_of_range:,} outside the range gate (min_range_m, "
+        f"max_range_m), {dropped.no_return:,} have no return; is the lidar blocked, or looked it at nothing but the airframe?"
+    )
 
 
 def without_strays(points: Points) -> Points:

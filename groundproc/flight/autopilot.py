@@ -5,7 +5,7 @@ All times here are nanoseconds since boot. A reboot inside a file begins a new s
 
 import itertools
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -17,6 +17,7 @@ from flightlog.constants import NS_PER_MS, NS_PER_US
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame
 from flightlog.vehicles import Address, Sender, Vehicles
+from groundproc.flight.sharing import parted
 from groundproc.flight.sound import possible
 from groundproc.flight.sync import GyroTrack
 
@@ -141,16 +142,21 @@ class Vehicle:
     boots : list of Boot
     source : str
         Where it was heard, if not on the link.
+    shared_by : int
+        Its number among the vehicles that share these addresses; 0 where they are its own.
     """
 
     addresses: tuple[Address, ...]
     boots: list[Boot]
     source: str = ""
+    shared_by: int = 0
 
     @property
     def name(self) -> str:
         """Its addresses, such as 1/1."""
         addresses = ", then ".join(f"{system}/{component}" for system, component in self.addresses)
+        if self.shared_by:
+            addresses += f" (sender {self.shared_by} of that id)"
         return f"{addresses} of {self.source}" if self.source else addresses
 
 
@@ -179,7 +185,15 @@ def vehicles(all_frames: Sequence[Frame]) -> list[Vehicle]:
     if not chains:
         raise LogError("MAVLink: no heartbeat of an autopilot and no attitudes in the log, expected one a second")
     chains.sort(key=lambda chain: -sum(elected[address] for address in chain))
-    return [Vehicle(tuple(chain), _boots(all_frames, chain)) for chain in chains]
+    return [vehicle for chain in chains for vehicle in _of(all_frames, chain)]
+
+
+def _of(all_frames: Sequence[Frame], addresses: Sequence[Address]) -> list[Vehicle]:
+    """The vehicle with these addresses; several where one address is shared."""
+    parts = parted([f for f in all_frames if f.known and (f.system, f.component) in addresses])
+    if len(parts) == 1:
+        return [Vehicle(tuple(addresses), _boots(parts[0]))]
+    return [Vehicle(tuple(addresses), _boots(part), shared_by=i + 1) for i, part in enumerate(parts)]
 
 
 def boots(all_frames: Sequence[Frame]) -> list[Boot]:
@@ -199,8 +213,7 @@ def _chains(senders: Mapping[Address, Sender]) -> list[list[Address]]:
     return chains
 
 
-def _boots(all_frames: Sequence[Frame], addresses: Collection[Address]) -> list[Boot]:
-    mine = [f for f in all_frames if f.known and (f.system, f.component) in addresses]
+def _boots(mine: Sequence[Frame]) -> list[Boot]:
     clock_ms = _running_clock_ms(mine)
     starts = [0, *_reboots(mine, clock_ms), len(mine)]
     return [

@@ -10,6 +10,7 @@ from flightlog.logfile import LogReader
 from groundproc.flight import load
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import LidarBatch, Progress
+from groundproc.flight.summary.lidar import LidarSummary
 from groundproc.flight.timeline import Leg
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate, LaserTable, Shots
@@ -34,10 +35,19 @@ class Tally:
     queue_drops: int = 0
     rejected: int = 0
     packets_without_leg: int = 0
+    summary: LidarSummary | None = None
+    """Tells from the stamps what is missing: recordings of other programs have no account."""
+
+    @property
+    def lost_packets(self) -> int:
+        """Packets that the lidar sent and nobody left out, and that are not there."""
+        return 0 if self.summary is None else int(self.summary.result()["lost_packets"])
 
     def add(self, batch: LidarBatch) -> None:
         """Add up what became of the packets before they reached the log."""
         self.packets += len(batch.packets)
+        if self.summary is not None:
+            self.summary.add(batch)
         if batch.account is not None:
             self.masked_packets += batch.account.masked_packets
             self.masked_blocks += batch.account.masked_blocks
@@ -73,6 +83,7 @@ def shots(
         Called with the number of file bytes done since the last call.
     """
     lidar, tally = lidar_of(readers), tally or Tally()
+    tally.summary = tally.summary or LidarSummary(lidar)
     for batches in _pieces(load.lidar_batches(readers, progress, lidar), lidar, tally):
         packets = load.joined([batch.packets for batch in batches])
         leg = _leg_of(int(batches[0].receive_time_ns[0]), timeline)

@@ -51,11 +51,14 @@ class Choice:
         Of all, the one taken first; empty where there is only one.
     notes : tuple of str
         Sentences for whoever reads the results.
+    shared : tuple of str
+        Addresses that several vehicles share.
     """
 
     vehicle: Vehicle
     scores: tuple[Score, ...] = ()
     notes: tuple[str, ...] = ()
+    shared: tuple[str, ...] = ()
 
     def described(self) -> list[dict[str, Any]]:
         """The scores for a report."""
@@ -74,6 +77,12 @@ def choose(vehicles: Sequence[Vehicle], runs: Sequence[LidarRun]) -> Choice:
     found = [_own(vehicle, runs) for vehicle in vehicles]
     vehicles = [vehicle for vehicle, _ in found]
     notes = [note for _, note in found if note]
+    shared = tuple(dict.fromkeys(Vehicle(each.addresses, []).name for each in vehicles if each.shared_by))
+    notes += [
+        f"several vehicles share the MAVLink id {name}, told apart by the numbers of their messages; give each an id of its own "
+        "(SYSID_THISMAV)"
+        for name in shared
+    ]
     if len(vehicles) == 1:
         return Choice(vehicles[0], notes=tuple(notes))
     scores = [_score(vehicle, runs) for vehicle in vehicles]
@@ -83,7 +92,7 @@ def choose(vehicles: Sequence[Vehicle], runs: Sequence[LidarRun]) -> Choice:
     others = " and ".join(score.name for score in ranked[1:])
     told = ", ".join(score.text for score in ranked)
     notes.append(f"{len(scores)} vehicles on the link: {ranked[0].name} is taken, {others} left out, {why} ({told})")
-    return Choice(vehicles[taken], ranked, tuple(notes))
+    return Choice(vehicles[taken], ranked, tuple(notes), shared)
 
 
 def _decide(scores: Sequence[Score]) -> tuple[int, str]:

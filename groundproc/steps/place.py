@@ -112,6 +112,7 @@ def _tell(path: Path, lidar: Lidar, projection: geodesy.Projection, tally: Tally
             "model": lidar.name,
             "packets": tally.packets,
             "packets_outside_every_leg": tally.packets_without_leg,
+            "lost_packets": tally.lost_packets,
             "aboard": {
                 "masked_packets": tally.masked_packets,
                 "masked_blocks": tally.masked_blocks,

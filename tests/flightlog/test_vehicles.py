@@ -47,6 +47,22 @@ def test_a_ground_station_with_the_words_of_an_autopilot_is_none() -> None:
     assert vehicles.vehicles() == [(1, 1)]
 
 
+def test_an_id_that_says_armed_and_disarmed_in_turn_is_armed() -> None:
+    """Two vehicles that share it, each with a heartbeat a second."""
+    vehicles = Vehicles()
+    for i in range(10):
+        vehicles.hear(beat(i * S, armed=True))
+        vehicles.hear(beat(i * S + S // 2))
+        assert i == 0 or vehicles.armed(i * S + S // 2) is True
+    # once only one of them is heard, it is believed
+    for i in range(10, 14):
+        vehicles.hear(beat(i * S))
+    assert vehicles.armed(13 * S) is False
+    # a landing is believed at once
+    landed = heard(beat(0, armed=True), beat(S, armed=True), beat(2 * S))
+    assert landed.armed(2 * S) is False
+
+
 def test_evidence_goes_before_heartbeats_whoever_was_first() -> None:
     vehicles = heard(beat(0, 7, 1), attitude(1, 3, 1), beat(2, 7, 1))
     assert vehicles.autopilot == (3, 1)

@@ -24,6 +24,7 @@ LOG: Figures = {
         "ins": {
             "frames": 6780,
             "lost_frames": 0,
+            "shared_ids": [],
             "bad_bytes": 0,
             "gps_fix_type": 3,
             "gps_after_first_fix": {"reports": 90, "without": 0},
@@ -53,7 +54,12 @@ FLIGHT: Figures = {
         "written": 10_000_000,
         "shots_dropped": {"no_pose": 70_000, "outside_fov": 8_000_000, "no_return": 1_000_000, "out_of_range": 0},
     },
-    "lidar": {"packets": 54_256, "packets_outside_every_leg": 0, "aboard": {"kernel_drops": 0, "queue_drops": 0}},
+    "lidar": {
+        "packets": 54_256,
+        "packets_outside_every_leg": 0,
+        "lost_packets": 0,
+        "aboard": {"kernel_drops": 0, "queue_drops": 0},
+    },
 }
 
 
@@ -88,6 +94,7 @@ def test_a_flight_without_a_fault_is_good() -> None:
         ("lidar/account/kernel_drops", 1000, DOUBTFUL, "lost_packets", "1,000 lidar packets"),
         ("mavlink", {}, DOUBTFUL, "autopilot", "swath decode"),
         ("mavlink/ins/lost_frames", 2000, DOUBTFUL, "lost_frames", "23%"),
+        ("mavlink/ins/shared_ids", ["1/1"], DOUBTFUL, "shared_id", "share the MAVLink id 1/1"),
         ("mavlink/ins/bad_bytes", 100_000, DOUBTFUL, "bad_bytes", "29%"),
         ("mavlink/ins/gps_fix_type", 1, BAD, "gnss", "never had a fix"),
         ("mavlink/ins/gps_after_first_fix/without", 30, DOUBTFUL, "gnss", "33% of the time"),
@@ -153,6 +160,7 @@ def test_small_losses_and_what_is_not_known_are_no_reason(path: str, value: Any)
         ("points/written", 0, BAD, "points", "not one point"),
         ("points/shots_dropped/no_pose", 3_000_000, DOUBTFUL, "no_pose", "14% of the lidar's shots"),
         ("lidar/packets_outside_every_leg", 10_000, DOUBTFUL, "no_pose", "19% of the lidar's shots"),
+        ("lidar/lost_packets", 1000, DOUBTFUL, "lost_packets", "1,000 lidar packets"),
         ("lidar/aboard/queue_drops", 1000, DOUBTFUL, "lost_packets", "1,000 lidar packets"),
     ],
 )

@@ -12,7 +12,8 @@ from typing import Final
 
 from flightlog import clock
 from flightlog.constants import HOUR_NS, NS_PER_S
-from groundproc.flight.importers.devices import Reading, reading
+from groundproc.flight.importers.devices import Reading
+from groundproc.flight.importers.foresight import foreseen
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.ordering import Order, Placed
 
@@ -137,8 +138,10 @@ class Steady:
 
     def judged(self, events: Iterable[Event]) -> Iterator[Placed]:
         """Events with mended times, in the order of the recording."""
-        for event in events:
-            read, before_ns, level = reading(event), self._time_ns, self._levels[-1]
+        for event, read, step_ns in foreseen(events):
+            before_ns, level = self._time_ns, self._levels[-1]
+            if step_ns and read is not None:
+                self._foresee(event.time_ns, read, step_ns)
             device_ns = None if read is None or read.time_ns is None else self._take(event.time_ns, read)
             if read is None or device_ns is None:
                 if read is not None and read.device in self._devices:
@@ -188,6 +191,15 @@ class Steady:
         device.sequence = read.sequence
         self._time_ns = time_ns
         return device_ns
+
+    def _foresee(self, raw_ns: int, read: Reading, step_ns: int) -> None:
+        """Make the level behind a small step ahead, unless another device's messages have told of it already."""
+        device, level = self._devices.get(read.device), self._levels[-1]
+        if device is None or read.time_ns is None:
+            return
+        late_ns = raw_ns + level.offset_ns - device.base_ns - device.time_ns - self._device_step(raw_ns, read, device)
+        if late_ns > step_ns // 2:
+            self._new_level(level.offset_ns - step_ns)
 
     def _meet(self, raw_ns: int, read: Reading) -> int | None:
         """The first message of a device: taken where its stamp is near those of the others, or is the first of all."""

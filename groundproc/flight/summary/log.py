@@ -221,8 +221,9 @@ def summarise(reader: LogReader, progress: Progress | None = None) -> dict[str, 
     damage = reader.damage
     found = summary.result()
     for link, mavlink in found["mavlink"].items():
-        if len(mavlink["autopilots"]) > 1:
-            mavlink["notes"] = _vehicle_notes(reader, link)
+        # numbers that jump all the time are of several senders with one id
+        if len(mavlink["autopilots"]) > 1 or mavlink["lost_frames"] > mavlink["frames"]:
+            _tell_vehicles(reader, link, mavlink)
     return {
         "file": str(reader.path),
         "bytes": reader.size,
@@ -238,9 +239,12 @@ def summarise(reader: LogReader, progress: Progress | None = None) -> dict[str, 
     }
 
 
-def _vehicle_notes(reader: LogReader, link: str) -> list[str]:
+def _tell_vehicles(reader: LogReader, link: str, mavlink: dict[str, Any]) -> None:
     """Which of several vehicles on a link is taken, by another reading of the log: gyros do not fit in bounded memory."""
     try:
-        return list(read_flight([reader], link).choice.notes)
+        choice = read_flight([reader], link).choice
     except SwathError as error:
-        return [f"several vehicles on the link, and no telling which carries the lidar: {error}"]
+        if len(mavlink["autopilots"]) > 1:
+            mavlink["notes"] = [f"several vehicles on the link, and no telling which carries the lidar: {error}"]
+        return
+    mavlink["notes"], mavlink["shared_ids"] = list(choice.notes), list(choice.shared)

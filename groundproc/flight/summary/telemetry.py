@@ -146,6 +146,7 @@ class TelemetrySummary:
             "first_system_time_utc": clock.utc_text(self.first_utc_ns) if self.first_utc_ns else None,
             "impossible_system_times": self.impossible_utc,
             "notes": [],
+            "shared_ids": [],
             "messages": [
                 _kind(key, kind)
                 for key, node in sorted(self.nodes.items())

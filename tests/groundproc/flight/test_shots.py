@@ -10,6 +10,7 @@ import pytest
 from flightlog import hdl32e
 from flightlog.constants import NS_PER_S
 from flightlog.logfile import LogReader
+from groundproc.cli import main
 from groundproc.field.madeup import write_flight
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
@@ -45,3 +46,24 @@ def test_a_piece_is_half_a_second_and_no_shot_is_lost_between_two(reader: LogRea
     assert sum(map(len, pieces)) + sum(gated) == tally.packets * hdl32e.BLOCKS * hdl32e.LASERS
     times = np.concatenate([piece.time_ns for piece in pieces])
     assert (np.diff(times) > 0).all()
+
+
+def test_packets_that_a_capture_lacks_are_counted_though_no_recorder_says_so(recordings: Path, tmp_path: Path) -> None:
+    thinned, log = tmp_path / "thinned.pcap", tmp_path / "a.mcap"
+    whole = (recordings / "lidar/hdl32e_monterey.pcap").read_bytes()
+    kept, place, data_packets, left_out = whole[:24], 24, 0, 0
+    while place < len(whole):
+        size = 16 + int.from_bytes(whole[place + 8 : place + 12], "little")
+        is_data = size > hdl32e.DATA_BYTES
+        data_packets += is_data
+        if is_data and data_packets % 7 == 3:
+            left_out += 1
+        else:
+            kept += whole[place : place + size]
+        place += size
+    thinned.write_bytes(kept)
+    assert main(["import", "--pcap", str(thinned), "-o", str(log)]) == 0
+    with LogReader(log) as opened:
+        tally = Tally()
+        assert list(shots([opened], [], Gate(), tally=tally)) == []
+    assert (tally.packets, tally.lost_packets) == (data_packets - left_out, left_out)

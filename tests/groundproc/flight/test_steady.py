@@ -191,6 +191,33 @@ def test_the_autopilots_clock_tells_a_step_of_the_ground_stations(telemetry: lis
     assert (steady.steps_ahead, steady.steps_back) == (int(step_s > 0), int(step_s < 0))
 
 
+@pytest.mark.parametrize("step_s", [0.7, 1.0, 2.0, 2.9, 3.5, -0.7, -2.0])
+@pytest.mark.parametrize("case", ["nan_attitude", "two_vehicles"])
+def test_a_step_no_longer_than_a_radio_delays_is_told_by_what_follows(cases: Path, step_s: float, case: str) -> None:
+    path = cases / case / "t.tlog"
+    source = Tlog(path, "ins", path)
+    right = list(source.events())
+    source.close()
+    middle = len(right) // 2
+    found, steady = put_right(stamped(right, lambda i, t: t + round(step_s * 1e9) * (i >= middle)))
+    # messages without a clock of their own just before the step get the time of the next one with one; order is restored
+    assert max(map(abs, errors_ns(found, right))) < 120 * NS_PER_MS
+    assert (steady.steps_ahead, steady.steps_back) == (int(step_s > 0), int(step_s < 0))
+
+
+def test_a_radio_that_delays_for_seconds_is_no_step(cases: Path) -> None:
+    """As a stalled link does: what was sent in two seconds comes at their end."""
+    path = cases / "nan_attitude/t.tlog"
+    source = Tlog(path, "ins", path)
+    right = list(source.events())
+    source.close()
+    begin_ns, end_ns = right[200].time_ns, right[200].time_ns + 2 * NS_PER_S
+    late = stamped(right, lambda i, t: end_ns if begin_ns <= t < end_ns else t)
+    found, steady = put_right(late)
+    assert errors_ns(found, late) == [0] * len(late)
+    assert (steady.steps_ahead, steady.steps_back) == (0, 0)
+
+
 @pytest.mark.parametrize("name", ["arducopter313_sim", "ardusub_2023", "copter_flight_2015"])
 def test_recorded_links_are_left_as_they_are(recordings: Path, name: str) -> None:
     path = recordings / f"mavlink/{name}.tlog"

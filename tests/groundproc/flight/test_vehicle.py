@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+import sharing
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog.logfile import LogReader
-from flightlog.mavlink import Frame
+from flightlog.mavlink import Frame, FrameParser
 from groundproc.cli import main
 from groundproc.flight import autopilot, timebase, vehicle
 from groundproc.flight.flight import read_flight
+from groundproc.flight.importers import tlog
+from groundproc.flight.sharing import parted
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun, legs
 from groundproc.steps.clocks import describe_sync
@@ -138,3 +141,54 @@ def test_a_reboot_under_a_new_id_is_kept_and_said(frames_of: FramesOf) -> None:
     choice = vehicle.choose([heard], [lidar_run(mine)])
     assert len(choice.vehicle.boots) == 2
     assert choice.notes == ("the autopilot's MAVLink address changed during the flight: 2/1, then 1/1",)
+
+
+# One id for several ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("later_ms", [0, 10_000, 100_000])
+def test_two_vehicles_with_one_id_are_told_apart_and_the_one_with_the_lidar_is_taken(
+    cases: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], later_ms: int
+) -> None:
+    link, log = tmp_path / "t.tlog", tmp_path / "a.mcap"
+    link.write_bytes(sharing.shared_tlog((cases / "two_vehicles/t.tlog").read_bytes(), later_ms))
+    words = ["import", "--pcap", str(cases / "two_vehicles/l.pcap"), "--mavlink", str(link), "-o", str(log)]
+    assert main(words) == 0
+    with LogReader(log) as reader:
+        flight = read_flight([reader], "ins")
+    (leg,) = legs(flight.runs, flight.boots, np.eye(3), "gyro")
+    assert -describe_sync(leg)["offset_s"] == pytest.approx(928.8388, abs=0.002)
+    first, second = flight.choice.described()
+    assert first["gyro_correlation"] > 0.9
+    assert second["gyro_correlation"] < 0.5
+    assert "share the MAVLink id 1/1" in flight.choice.notes[0]
+    assert main(["info", str(log)]) == 3
+    text = capsys.readouterr().out
+    assert "told apart by the numbers of their messages" in text
+    assert "verdict: doubtful: several vehicles share the MAVLink id 1/1" in text
+
+
+def test_one_vehicle_heard_by_two_links_stays_one(frames_of: FramesOf) -> None:
+    rates = motion(1)
+    twice = [frames_of(attitudes(rates, first, 6000, 5_000 + first), system=1) for first in (0, 2)]
+    other = [frame._replace(sequence=(frame.sequence + 100) % 256) for frame in twice[1]]
+    (only,) = autopilot.vehicles(together(twice[0], other))
+    assert only.name == "1/1"
+    assert len(only.boots) == 1
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_a_link_that_loses_most_of_its_messages_is_of_one_vehicle(frames_of: FramesOf, share: float) -> None:
+    frames = frames_of(attitudes(motion(1), 0, 6000, 5_000), system=1)
+    kept = np.random.default_rng(4).random(len(frames)) > share
+    (only,) = autopilot.vehicles([frame for frame, keep in zip(frames, kept, strict=True) if keep])
+    assert only.name == "1/1"
+
+
+@pytest.mark.parametrize("name", ["arducopter313_sim", "ardusub_2023", "copter_flight_2015"])
+def test_recorded_links_are_of_one_vehicle(recordings: Path, name: str) -> None:
+    frames = [frame for record in tlog.records((recordings / f"mavlink/{name}.tlog").read_bytes(), tlog.TlogCount())
+              for frame in FrameParser().feed(record.time_ns, record.data)]  # fmt: skip
+    for address in {(frame.system, frame.component) for frame in frames if frame.known}:
+        mine = [frame for frame in frames if frame.known and (frame.system, frame.component) == address]
+        assert len(parted(mine)) == 1
