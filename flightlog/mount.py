@@ -1,6 +1,7 @@
 """Where the sensors sit on the airframe: lever arms and boresight, as a frozen value and as YAML."""
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,7 @@ class Mount:
 
     def mat_ins_lidar(self) -> npt.NDArray[np.float64]:
         """Column matrix "ins from sensor", shape (3, 3)."""
-        angles = np.deg2rad([self.lidar.yaw_deg, self.lidar.pitch_deg, self.lidar.roll_deg])
-        return rotation(*angles).T
+        return _mat_ins_lidar(self.lidar)
 
     def lidar_position_m(self) -> npt.NDArray[np.float64]:
         """Lever arm of the lidar in the ins frame [m], shape (3,)."""
@@ -64,3 +64,10 @@ def load_mount(path: str | Path) -> Mount:
 def parse_mount(text: str, place: str) -> Mount:
     """Read the text of a mount file; `place` names it in errors."""
     return config.loads(text, Mount, place)
+
+
+@functools.lru_cache(maxsize=64)
+def _mat_ins_lidar(lidar: LidarMount) -> npt.NDArray[np.float64]:
+    mat = rotation(*np.deg2rad([lidar.yaw_deg, lidar.pitch_deg, lidar.roll_deg])).T
+    mat.flags.writeable = False
+    return mat

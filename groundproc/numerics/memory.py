@@ -4,6 +4,8 @@ The system clears each page of fresh memory when it is first touched. Arrays of 
 flight lose more time to that than to decoding and placing the shots that fill them.
 """
 
+import contextlib
+import mmap
 import weakref
 from collections import deque
 from math import prod
@@ -14,6 +16,8 @@ import numpy.typing as npt
 
 _SMALL: Final = 1 << 17
 """Below so many bytes numpy's own arrays are as fast."""
+_LARGE_PAGE: Final = 1 << 21
+"""Bytes of a large page; a block of fewer has none."""
 _SPARE: Final = 4
 """Blocks of one size kept for later; the others go back to the system."""
 
@@ -39,8 +43,18 @@ class Pool:
         try:
             block = spare.pop()
         except IndexError:
-            block = np.empty(block_size, np.uint8)
+            block = _fresh(block_size)
         # numpy lets a view hold the array that owns the memory; here that is this array, of which the block knows when it dies
         lent = np.frombuffer(block.data, kind, count)
         weakref.finalize(lent, spare.append, block).atexit = False
         return lent.reshape(shape)
+
+
+def _fresh(size: int) -> npt.NDArray[np.uint8]:
+    """Memory of the system, on large pages where it has some: fewer addresses to look up."""
+    if size < _LARGE_PAGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.empty(size, np.uint8)
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with contextlib.suppress(OSError):
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(memory, np.uint8)
