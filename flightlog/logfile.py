@@ -24,7 +24,7 @@ from flightlog.walk import ChunkAt, Hole, Walk
 _TOPICS: Final = "swath.topics"
 _CHECK: Final = "crc32"
 
-_QOS: Final = (
+QOS: Final = (
     "- history: 1\n  depth: 10\n  reliability: 1\n  durability: 2\n"
     "  deadline: {sec: 9223372036, nsec: 854775807}\n  lifespan: {sec: 9223372036, nsec: 854775807}\n"
     "  liveliness: 1\n  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}\n"
@@ -111,7 +111,7 @@ class LogWriter:
         if row.schema not in self._schemas:
             self._schemas[row.schema] = self._writer.add_schema(row.schema, "ros2msg", row.definition.encode())
         self._channels[topic] = self._writer.add_channel(
-            topic, "cdr", self._schemas[row.schema], {"offered_qos_profiles": _QOS}
+            topic, "cdr", self._schemas[row.schema], {"offered_qos_profiles": QOS}
         )
 
     def write(self, topic: str, log_time_ns: int, data: bytes) -> None:

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +55,33 @@ class Flight:
     board_not_finite: int = 0
 
 
+def read_clocks(
+    readers: Sequence[LogReader], link: str, progress: Progress | None = None
+) -> tuple[list[LidarRun], list[Boot], Lidar]:
+    """The runs of the lidar's clock and the boots of the autopilot, of which there may be none; and the lidar.
+
+    Raises
+    ------
+    LogError
+        No lidar packets in the logs.
+    """
+    if any(
+        True
+        for reader in readers
+        for _ in reader.messages((records.MAVLINK.topic + link, records.DATAFLASH.topic + link))
+    ):
+        flight = read_flight(readers, link, progress)
+        return flight.runs, flight.boots, flight.lidar
+    lidar = lidar_of(readers)
+    runs = _runs(readers, load.position_samples(readers, progress), lidar)
+    if not runs:
+        raise LogError(_NO_LIDAR.format(readers[0].path))
+    return runs, [], lidar
+
+
+_NO_LIDAR: Final = "{}: no lidar packets in the log"
+
+
 def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | None = None) -> Flight:
     """Read autopilot and lidar clock of one flight.
 
@@ -77,7 +105,7 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     merged = merging.merge(autopilot.vehicles(kept) if count else [], boards)
     runs = _runs(readers, samples.samples(), lidar)
     if not runs:
-        raise LogError(f"{readers[0].path}: no lidar packets in the log")
+        raise LogError(_NO_LIDAR.format(readers[0].path))
     choice = vehicle.choose(merged.vehicles, runs)
     choice = replace(choice, notes=choice.notes + merged.notes)
     return Flight(

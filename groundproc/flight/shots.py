@@ -2,16 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from flightlog.logfile import LogReader
 from groundproc.flight import load
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import LidarBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
-from groundproc.flight.timeline import Leg
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate, LaserTable, Shots
 
@@ -22,6 +22,21 @@ Of shorter pieces decoding loses up to a fifth of its speed.
 """
 _SLACK_NS: Final = 10**9
 """A batch belongs to a leg up to so long before and after the leg was received."""
+
+
+class LidarClock(Protocol):
+    """A stretch of receive times [log] in which the lidar's time has one way to the scale of a flight: a leg, or a clock tie."""
+
+    @property
+    def first_receive_ns(self) -> int:
+        """Where it begins."""
+
+    @property
+    def last_receive_ns(self) -> int:
+        """Where it ends."""
+
+    def utc_from_lidar(self, time_ns: npt.NDArray[np.int64], /) -> npt.NDArray[np.int64]:
+        """Times on the scale [ns] of lidar times, shape (n,)."""
 
 
 @dataclass(slots=True)
@@ -60,7 +75,7 @@ class Tally:
 
 def shots(
     readers: Sequence[LogReader],
-    timeline: Sequence[Leg],
+    timeline: Sequence[LidarClock],
     gate: Gate,
     lasers: LaserTable | None = None,
     tally: Tally | None = None,
@@ -72,7 +87,7 @@ def shots(
     ----------
     readers : sequence of LogReader
         The flight's logs.
-    timeline : sequence of Leg
+    timeline : sequence of LidarClock
         Each with a line from lidar time to UTC; packets outside all of them are counted and left out.
     gate : Gate
     lasers : LaserTable, optional
@@ -112,7 +127,7 @@ def _pieces(batches: Iterator[LidarBatch], lidar: Lidar, tally: Tally) -> Iterat
         yield waiting
 
 
-def _leg_of(receive_ns: int, timeline: Sequence[Leg]) -> Leg | None:
+def _leg_of(receive_ns: int, timeline: Sequence[LidarClock]) -> LidarClock | None:
     """The leg in which something was received at a time [ns of log time]."""
     return next(
         (leg for leg in timeline if leg.first_receive_ns - _SLACK_NS <= receive_ns <= leg.last_receive_ns + _SLACK_NS),

@@ -95,6 +95,12 @@ class ClockTie:
     lines: tuple[Line, ...]
     source: str
 
+    def utc_from_lidar(self, time_ns: Times) -> Times:
+        """UTC [ns] of lidar times, shape (n,)."""
+        for line in self.lines:
+            time_ns = line(time_ns)
+        return time_ns
+
     def overlap_ns(self, first_receive_ns: int, last_receive_ns: int) -> int:
         """How long this run and a stretch of receive time have in common; negative where they are apart."""
         return min(self.last_receive_ns, last_receive_ns) - max(self.first_receive_ns, first_receive_ns)
@@ -131,9 +137,12 @@ class Leg:
 
     def utc_from_lidar(self, time_ns: Times) -> Times:
         """UTC [ns] of lidar times, shape (n,)."""
-        for line in self.lidar_line:
-            time_ns = line(time_ns)
-        return time_ns
+        return self.tie.utc_from_lidar(time_ns)
+
+    @property
+    def tie(self) -> ClockTie:
+        """The lidar's clock of this leg."""
+        return ClockTie(self.first_receive_ns, self.last_receive_ns, self.lidar_line, self.utc.source)
 
     def utc_from_boot(self, time_ns: Times) -> Times:
         """UTC [ns] of boot times, shape (n,)."""
@@ -143,10 +152,7 @@ class Leg:
 def ties_of(timeline: Sequence[Leg]) -> tuple[ClockTie, ...]:
     """The lidar's clock of each run in a timeline; legs of one run share it."""
     runs = {leg.run: leg for leg in reversed(timeline)}
-    return tuple(
-        ClockTie(leg.first_receive_ns, leg.last_receive_ns, leg.lidar_line, leg.utc.source)
-        for _, leg in sorted(runs.items())
-    )
+    return tuple(leg.tie for _, leg in sorted(runs.items()))
 
 
 def tied(timeline: Sequence[Leg], ties: Sequence[ClockTie]) -> list[Leg]:
