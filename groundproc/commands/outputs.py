@@ -4,8 +4,9 @@ Folders above a name that are missing are made, by every command, when it writes
 """
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
@@ -66,3 +67,18 @@ def _refuse(path: Path, force: bool) -> None:
 
     if path.exists() and not force:
         raise UsageError(f"{path}: exists already; give another name, or --force to write over it")
+
+
+def write_json(path: Path, told: Mapping[str, Any]) -> None:
+    """Write figures, aside and then renamed.
+
+    Raises
+    ------
+    SourceError
+    """
+    import json
+
+    from groundproc.files import written_aside
+
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,209 @@
+"""`swath reflectance` as a list of stages: what there is, where the sensor was, surfaces, constants, clouds with reflectance."""
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from flightlog.errors import CoverageError
+from groundproc.cloud import reader
+from groundproc.cloud.reader import Chunk
+from groundproc.cloud.rewriter import Rewriter
+from groundproc.cloud.tiles import Found, Tiles, side_for
+from groundproc.files import made_folder, written_aside
+from groundproc.numerics import normals
+from groundproc.radiometry import report, signal
+from groundproc.radiometry.atmosphere import transmission
+from groundproc.radiometry.calibration import FEWEST, Constant, Echoes, combine, constant_of
+from groundproc.radiometry.gains import Gains, gains, speckle
+from groundproc.radiometry.site import STEEPEST, Progress, Sample, Site, Task, check_names, check_path, look
+from groundproc.radiometry.targets import Target
+
+Array = npt.NDArray[np.float64]
+
+REPORT: Final = "calibration.json"
+COLUMNS: Final = ("reflectance", "reflectance_sigma")
+_ROUGHEST_M: Final = 0.2
+_LEAST_KNOWN_RAD: Final = np.deg2rad(2.0)
+"""Beyond these a plane is a canopy or a chance, whose leaves lie otherwise: real strips over wood differ more with its cosine."""
+_LEAVES: Final = 0.5
+"""Relative sigma of an echo from no surface, whose incidence is taken as 0."""
+_KEPT: Final = {
+    "strength": "f4", "range": "f4", "east": "f4", "north": "f4", "up": "f4", "laser": "u1", "strip": "u2", "single": "?"
+}  # fmt: skip
+_FOUND: Final = {"range": "f4", "cosine": "f4", "tilt": "f4"}
+
+
+def run(task: Task, progress: Progress) -> dict[str, Any]:
+    """Calibrate, write, and give what the report holds.
+
+    Raises
+    ------
+    SwathError
+        Input that cannot be used; nothing is written then.
+    """
+    signal.check_kind(task.kind)
+    transmission(np.zeros(1), task.visibility_km, task.wavelength_nm)
+    check_names(task)
+    site = look(task, progress)
+    with made_folder(task.folder):
+        found = _surfaces(site, progress)
+        told, gain, c_cal, sigma = _constants(site)
+        _write(site, found, gain, (c_cal, sigma), progress)
+        with written_aside(task.folder / REPORT) as aside:
+            aside.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    return told
+
+
+def _placed(site: Site, progress: Progress, stage: str) -> Iterator[tuple[Chunk, int, Array, npt.NDArray[np.bool_]]]:
+    for number, cloud in enumerate(site.clouds):
+        for chunk in reader.chunks(cloud, site.path.clock, ("laser", "range", "point_source_id")):
+            place, known = site.path.at(chunk)
+            yield chunk, number, place, known
+            progress(stage, len(chunk.points))
+
+
+def _surfaces(site: Site, progress: Progress) -> Found:
+    """Range and incidence of all points; what the constants are made of is gathered on the way."""
+    survey, folder = site.survey, site.task.folder
+    tiles = Tiles(
+        folder,
+        _KEPT,
+        side_for(survey.points, survey.low.tolist(), survey.high.tolist(), normals.HALO_M),
+        normals.HALO_M,
+    )
+    sample = Sample(survey.points)
+    for chunk, number, place, known in _placed(site, progress, "placing"):
+        away = place - chunk.points.xyz_m
+        range_m = np.linalg.norm(away, axis=1)
+        site.known += int(known.sum())
+        raw = site.signal.raw(chunk.record)
+        range_m[~known] = np.nan
+        away /= np.where(known & (range_m > 0), range_m, 1.0)[:, None]
+        source = chunk.points.columns["point_source_id"]
+        strength = np.where(site.good(raw), site.signal.linear(raw), np.nan)
+        single = np.asarray(chunk.record.number_of_returns) <= 1
+        tiles.add(chunk.points.xyz_m, {
+            "strength": strength, "range": range_m, "east": away[:, 0], "north": away[:, 1], "up": away[:, 2],
+            "laser": chunk.points.columns.get("laser", np.zeros(len(source), np.uint8)),
+            "strip": source if len(site.clouds) == 1 or source.any() else np.full(len(source), number, np.uint16),
+            "single": single,
+        })  # fmt: skip
+        sample.add(raw[known], range_m[known], chunk.points.columns.get("range"), known)
+    check_path(site, sample)
+    found = Found(folder, _FOUND, survey.points)
+    for tile in tiles:
+        lies = normals.normals(tile.xyz_m)
+        core = np.flatnonzero(tile.core)
+        columns = {name: values[core] for name, values in tile.columns.items()}
+        way = np.stack([columns["east"], columns["north"], columns["up"]], axis=1).astype(np.float64)
+        cosine = np.abs(np.einsum("ni,ni->n", lies.normal[core], way))
+        tilt = lies.sigma_rad[core]
+        cosine[(lies.roughness_m[core] > _ROUGHEST_M) | (tilt > _LEAST_KNOWN_RAD)] = np.nan
+        found.put(tile.number[core], {"range": columns["range"], "cosine": cosine, "tilt": tilt})
+        site.on_surface += int(np.isfinite(cosine).sum())
+        _gather(site, tile.xyz_m[core], columns, cosine, tilt)
+        progress("surfaces", len(core))
+    return found
+
+
+def _gather(site: Site, xyz_m: Array, columns: dict[str, npt.NDArray[Any]], cosine: Array, tilt: Array) -> None:
+    """Take the points of a square: for gains, for the comparison of strips, and within targets."""
+    range_m = columns["range"].astype(np.float64)
+    strength = columns["strength"].astype(np.float64)
+    usable = np.isfinite(strength) & np.isfinite(range_m)
+    surface = usable & np.isfinite(cosine)
+    freed = strength * site.factor(range_m, np.where(surface, cosine, 1.0))
+    single = usable & columns["single"]  # of a beam that meets several things, each echo has a part
+    site.patches.add(xyz_m[single], columns["strip"][single], strength[single], freed[single])
+    alone = surface & columns["single"] & (cosine > np.cos(np.deg2rad(70.0)))
+    site.patches.add_lasers(
+        xyz_m[alone], columns["laser"][alone], np.arccos(np.minimum(cosine[alone], 1.0)), freed[alone]
+    )
+    for number, target in enumerate(site.targets):
+        west, south, east, north = target.polygon.bounds
+        near = surface & (xyz_m[:, 0] >= west) & (xyz_m[:, 0] <= east) & (xyz_m[:, 1] >= south) & (xyz_m[:, 1] <= north)
+        rows = np.flatnonzero(near)
+        rows = rows[shapely.contains_xy(target.polygon, xyz_m[rows, 0], xyz_m[rows, 1])]
+        if len(rows):
+            part = [strength[rows], range_m[rows], cosine[rows], tilt[rows], columns["laser"][rows]]
+            site.echoes[number].append(np.column_stack(part))
+
+
+def _constants(site: Site) -> tuple[dict[str, Any], Gains, float, float]:
+    """Gains of lasers and c_cal, and the report."""
+    table = site.patches.table()
+    gain = gains(table)
+    constants: list[Constant] = []
+    unused: list[str] = []
+    for target, parts in zip(site.targets, site.echoes, strict=True):
+        one = constant_of(_echoes(site, target, np.concatenate(parts), gain)) if parts else None
+        if one is None:
+            unused.append(target.id)
+        else:
+            constants.append(one)
+    relative = not site.targets
+    if site.targets:
+        if not constants:
+            raise CoverageError(
+                f"{site.task.targets}: not one of {len(site.targets)} targets has {FEWEST} echoes from a surface within it"
+            )
+        c_cal, sigma = combine(constants)
+    else:
+        c_cal, sigma = _without_targets(site), float("nan")
+    told = report.told(site, gain, constants, unused, (c_cal, sigma), relative)
+    told["speckle"] = round(speckle(table), 4)
+    return told, gain, c_cal, sigma
+
+
+def _echoes(site: Site, target: Target, rows: Array, gain: Gains) -> Echoes:
+    strength, range_m, cosine, tilt, laser = rows.T
+    angle = np.arccos(np.minimum(cosine, 1.0))
+    return Echoes(
+        target.id, strength / gain.gain[laser.astype(np.int64)], target.at(angle) / site.factor(range_m, cosine), angle, tilt,
+        1.0 if site.signal.unit_db == 1.0 and site.signal.field == "intensity" else 0.0,
+    )  # fmt: skip
+
+
+def _without_targets(site: Site) -> float:
+    """c_cal by the sensor's own scale, or such that reflectances have a usual median."""
+    if site.signal.kind == signal.COMPENSATED:
+        return signal.NOMINAL
+    if site.signal.kind == signal.DECIBEL:
+        return 1.0
+    return report.RELATIVE / max(site.patches.typical(), 1e-300)
+
+
+def _write(site: Site, found: Found, gain: Gains, c_cal: tuple[float, float], progress: Progress) -> None:
+    """The clouds once more, with the reflectance of every echo."""
+    start = 0
+    spread = speckle(site.patches.table())
+    constant = 0.0 if np.isnan(c_cal[1]) else c_cal[1] / c_cal[0]
+    with ExitStack() as stack:
+        for cloud in site.clouds:
+            aside = stack.enter_context(written_aside(site.task.folder / cloud.path.with_suffix(".laz").name))
+            with Rewriter(cloud, aside, added=COLUMNS) as new:
+                for chunk in reader.chunks(cloud, columns=("laser",)):
+                    count = len(chunk.points)
+                    known = found.take(start, count)
+                    start += count
+                    raw = site.signal.raw(chunk.record)
+                    laser = chunk.points.columns.get("laser", np.zeros(count, np.uint8))
+                    cosine = known["cosine"].astype(np.float64)
+                    flat = np.isfinite(cosine)
+                    freed = site.signal.linear(raw) * site.factor(
+                        known["range"].astype(np.float64), np.where(flat, cosine, 1.0)
+                    )
+                    value = np.where(site.good(raw), c_cal[0] * freed / gain.gain[laser], np.nan)
+                    tan = np.sqrt(np.maximum(1.0 / np.maximum(np.where(flat, cosine, 1.0), STEEPEST) ** 2 - 1.0, 0.0))
+                    tilt = np.where(flat, tan * np.nan_to_num(known["tilt"]), _LEAVES)
+                    step = 0.2887 / np.maximum(raw, 0.5) if site.signal.field == "intensity" else 0.0
+                    sigma = value * np.sqrt(
+                        constant**2 + spread**2 + tilt**2 + np.square(step) + gain.sigma[laser] ** 2 * flat
+                    )
+                    new.write(chunk.record, columns={"reflectance": value, "reflectance_sigma": sigma})
+                    progress("writing", count)

@@ -1,0 +1,172 @@
+"""`swath reflectance`: panels and fields get the reflectance that they were made with, at every range and incidence."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pyogrio
+import pyproj
+import pytest
+import shapely
+from strips import ORIGIN, Scene, Strip, Surface, write_cloud
+
+from groundproc.cli import main
+
+PANELS = {"dark": 0.046, "grey": 0.303, "white": 0.813}
+
+
+def scene(**options: Any) -> Scene:
+    """Three panels on a field, three tilted ones, and two strips at different heights beside them."""
+    surfaces = [Surface((0, 0, 0.0), (10, 0, 0), (0, 8, 0), 0.35, per_m2=130, texture=0.2)]
+    for i, value in enumerate(PANELS.values()):
+        surfaces.append(Surface((-6 + 6 * i, 0, 0.3), (0.6, 0, 0), (0, 0.6, 0), value, 600))
+        slope = np.radians(25 + 15 * i)
+        surfaces.append(
+            Surface((-6 + 6 * i, 6, 1.2), (0.5, 0, 0), (0, 0.5 * np.cos(slope), 0.5 * np.sin(slope)), value, 600)
+        )
+    strips = [Strip((-25, -20, 12), (2.5, 0, 0), 0, 20), Strip((-25, 25, 40), (2.5, 0, 0), 40, 20)]
+    return Scene(surfaces, strips, **options)
+
+
+def targets(path: Path, epsg: int = 32633, columns: dict[str, list[float]] | None = None, at: float = 0.0) -> Path:
+    shapes = [shapely.box(-6 + 6 * i - 0.6 + at, -0.6, -6 + 6 * i + 0.6 + at, 0.6) for i in range(3)]
+    shapes = [shapely.transform(each, lambda xy: xy + ORIGIN[:2]) for each in shapes]
+    if epsg != 32633:
+        to = pyproj.Transformer.from_crs(32633, epsg, always_xy=True)
+        shapes = [shapely.transform(each, lambda xy: np.stack(to.transform(*xy.T), axis=1)) for each in shapes]
+    columns = columns or {"reflectance": list(PANELS.values())}
+    pyogrio.raw.write(
+        path, shapely.to_wkb(np.array(shapes, object)), [np.array(list(PANELS), object), *(np.array(v) for v in columns.values())],
+        ["id", *columns], geometry_type="Polygon", crs=f"EPSG:{epsg}", driver="GPKG" if path.suffix == ".gpkg" else "GeoJSON",
+    )  # fmt: skip
+    return path
+
+
+def run(tmp_path: Path, made: Scene, echoes: dict[str, Any], *options: str, **cloud: Any) -> tuple[Any, dict[str, Any]]:
+    path = write_cloud(tmp_path / "a.laz", echoes, **cloud)
+    track = made.write_trajectory(tmp_path / "trajectory.csv")
+    words = ["reflectance", str(path), "--trajectory", str(track), "-o", str(tmp_path / "out"), *options]
+    assert main(words) == 0
+    return laspy.read(tmp_path / "out" / "a.laz"), json.loads((tmp_path / "out" / "calibration.json").read_text())
+
+
+def worst(found: Any, echoes: dict[str, Any], steepest_deg: float = 70.0) -> float:
+    """Largest error of a mean over a panel or a cell of a metre of 100 echoes or more, strip by strip."""
+    value = np.asarray(found["reflectance"], np.float64)
+    cell = np.floor(echoes["xyz"][:, :2]).astype(np.int64)
+    cell[echoes["surface"] > 0] = 0
+    keys = np.column_stack([echoes["surface"], echoes["strip"], cell])
+    fine = np.isfinite(value) & (echoes["cosine"] > np.cos(np.radians(steepest_deg)))
+    _, number = np.unique(keys[fine], axis=0, return_inverse=True)
+    number = number.ravel()
+    count = np.bincount(number)
+    error = (np.bincount(number, value[fine]) - np.bincount(number, echoes["rho"][fine])) / count
+    assert (count >= 100).sum() > 150
+    return float(np.abs(error[count >= 100]).max())
+
+
+def test_compensated_intensities_become_reflectance(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    made = scene(gains=1.0 + 0.15 * rng.standard_normal(32), response=lambda s, r: 80.0 * s)
+    echoes = made.make()
+    found, told = run(tmp_path, made, echoes, "--targets", str(targets(tmp_path / "t.geojson", 4326)))
+    assert told["intensity"] == "compensated"
+    assert len(found) == len(echoes["xyz"])
+    np.testing.assert_allclose(found.xyz, echoes["xyz"] + ORIGIN, atol=0.00051)
+    assert worst(found, echoes) < 0.02
+    gains = made.gains / made.gains.mean()
+    for name, each in told["laser_gains"].items():
+        assert abs(each["gain"] - gains[int(name)]) < 4 * each["sigma"]
+    assert np.isclose(np.mean([each["gain"] for each in told["laser_gains"].values()]), 1.0)
+    true = 1.0 / 80.0 / made.gains.mean()
+    assert abs(told["c_cal"] - true) < 3 * told["c_cal_sigma"]
+    assert told["c_cal_sigma"] < 0.02 * true
+
+
+@pytest.mark.parametrize("visibility", [None, 3.0])
+def test_amplitudes_are_freed_of_range_and_air(tmp_path: Path, visibility: float | None) -> None:
+    # 3.91 / 3 km (905 / 550)^-(0.585 x 3^(1/3))
+    per_m = 0.0 if visibility is None else 3.91 / 3.0 * (905 / 550) ** -(0.585 * 3 ** (1 / 3)) / 1e3
+    made = scene(response=lambda s, r: 2e7 * s / r**2 * np.exp(-2 * per_m * r), noise_m=0.02)
+    echoes = made.make(2)
+    options = [] if visibility is None else ["--visibility-km", "3"]
+    found, told = run(tmp_path, made, echoes, "--targets", str(targets(tmp_path / "t.gpkg")), *options, laser=False)
+    assert told["intensity"] == "amplitude"
+    assert worst(found, echoes) < 0.02
+    assert abs(told["c_cal"] * 2e7 - 1.0) < 3 * told["c_cal_sigma"] * 2e7
+    field = [each for each in told["strips"] if each["patches"]]
+    for each in field:
+        assert abs(each["reflectance_percent"]) < 0.2 * abs(each["raw_percent"])
+
+
+def test_reflectance_by_incidence_is_interpolated(tmp_path: Path) -> None:
+    made = scene(response=lambda s, r: 80.0 * s)
+    for surface in made.surfaces:
+        surface.exponent = 1.4
+    echoes = made.make(3)
+    angles = range(0, 90, 15)
+    columns = {
+        f"reflectance_{a}": [v * max(np.cos(np.radians(a)), 0.1) ** 0.4 for v in PANELS.values()] for a in angles
+    }
+    _, told = run(tmp_path, made, echoes, "--targets", str(targets(tmp_path / "t.gpkg", columns=columns)))
+    assert abs(told["c_cal"] * 80.0 - 1.0) < 0.01
+
+
+def test_retro_reflectors_and_saturation_have_none(tmp_path: Path) -> None:
+    made = scene(response=lambda s, r: 80.0 * s, speckle=0.05)
+    echoes = made.make(4)
+    echoes["intensity"][::50] = 180
+    found, told = run(tmp_path, made, echoes)
+    value = np.asarray(found["reflectance"])
+    assert np.isnan(value[::50]).all()
+    assert np.isfinite(np.delete(value, np.s_[::50])).all()
+    assert told["relative"]
+    assert told["c_cal"] == 0.01
+    assert told["c_cal_sigma"] is None
+
+
+def test_laser_powers_of_firmware_1_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = scene()
+    echoes = made.make(5)
+    signal = echoes["rho"] * echoes["cosine"] / echoes["range"] ** 2
+    rank = np.log(signal / signal.max()) / np.log(signal.min() / signal.max())
+    echoes["intensity"] = np.rint(10 * rank)
+    path = write_cloud(tmp_path / "a.laz", echoes)
+    track = made.write_trajectory(tmp_path / "t.csv")
+    assert main(["reflectance", str(path), "-t", str(track), "-o", str(tmp_path / "out")]) == 1
+    assert "firmware 1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = scene()
+    echoes = {name: values[::20] for name, values in made.make(6).items()}
+    track = made.write_trajectory(tmp_path / "t.csv")
+    later = tmp_path / "later.csv"
+    rows = track.read_text().splitlines()
+    later.write_text(
+        "\n".join([rows[0], *(f"{int(r.split(',', 1)[0]) + 10**12},{r.split(',', 1)[1]}" for r in rows[1:])])
+    )
+    good = write_cloud(tmp_path / "good.laz", echoes)
+    dark = write_cloud(tmp_path / "dark.laz", {**echoes, "intensity": 0 * echoes["intensity"]})
+    placeless = write_cloud(tmp_path / "placeless.laz", echoes, epsg=None)
+    far = str(targets(tmp_path / "far.gpkg", at=500.0))
+    for words, expected in (
+        ([good, "-t", later], "have no pose|no pose"),
+        ([dark, "-t", track], "have no intensity"),
+        ([placeless, "-t", track], "states no CRS"),
+        ([good, "-t", track, "--targets", far], "lie outside of the clouds"),
+        ([good], "give the trajectory with --trajectory"),
+        ([good, "-t", track, "--visibility-km", "0.1"], "visibility 0.1 km"),
+        ([good, "-t", track, "--intensity", "volts"], "--intensity volts"),
+        ([good, "-t", track, "--geoid", "-2000"], "heights those of the cloud|would have been"),
+    ):
+        out = tmp_path / "out"
+        assert main(["reflectance", *map(str, words), "-o", str(out)]) in (1, 2), expected
+        told = capsys.readouterr().err.strip()
+        assert "\n" not in told
+        assert re.search(expected, told), told
+        assert not out.exists()
