@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CoverageError
+from groundproc.numerics.robust import sigma
 
 Array = npt.NDArray[np.float64]
 
@@ -73,7 +74,7 @@ def constant_of(echoes: Echoes) -> Constant | None:
         return None
     ratio = echoes.strength[keep] / echoes.expected[keep]
     middle = np.median(ratio)
-    scatter = max(1.4826 * float(np.median(np.abs(ratio - middle))), 1e-9 * float(middle))
+    scatter = max(sigma(ratio), 1e-9 * float(middle))
     # a target that stands over other ground, or with something on it: leave out what differs grossly
     rows = np.flatnonzero(keep)[np.abs(ratio - middle) <= max(_OUTSIDE * scatter, 0.1 * float(middle))]
     strength, expected = echoes.strength[rows], echoes.expected[rows]
@@ -90,8 +91,8 @@ def constant_of(echoes: Echoes) -> Constant | None:
         * min(1.0, echoes.quantum / max(float(strength.std()), 1e-12) / 4.0)
     )
     tilt = float(np.mean(np.tan(echoes.incidence_rad[rows]) * np.nan_to_num(echoes.incidence_sigma_rad[rows])))
-    sigma = c_cal * float(np.sqrt(noise**2 + step**2 + tilt**2))
-    return Constant(echoes.id, len(rows), c_cal, sigma, float(np.rad2deg(echoes.incidence_rad[rows].mean())))
+    unsure = c_cal * float(np.sqrt(noise**2 + step**2 + tilt**2))
+    return Constant(echoes.id, len(rows), c_cal, unsure, float(np.rad2deg(echoes.incidence_rad[rows].mean())))
 
 
 def combine(constants: Sequence[Constant]) -> tuple[float, float]:
