@@ -115,7 +115,7 @@ class Camera:
 
     def with_values(self, changes: Mapping[str, float]) -> "Camera":
         """The same camera with some values changed."""
-        values = self.values() | dict(changes)
+        values = self.values() | {name: float(value) for name, value in changes.items()}
         return replace(
             self,
             focal_px=values["f"],

@@ -1,0 +1,107 @@
+"""Rows of poses that were observed and of values of cameras that were known before: dense, for they have no points."""
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog import frames
+from groundproc.imagery import lenses
+from groundproc.imagery.bundle.block import POSE, Block, PosePriors
+from groundproc.imagery.bundle.unknowns import Unknowns
+from groundproc.imagery.rig import MOUNTING, RigCamera
+from groundproc.imagery.rotations import cross_matrix
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+PRIOR_UNIT = {"boresight": ("boresight_deg", np.pi / 180.0), "lever": ("lever_arm_m", 1.0)}
+
+
+def pose_residuals(block: Block, priors: PosePriors) -> Array:
+    """Station minus observed pose: place [m] and turn in the local frame [rad], shape (k, 6)."""
+    stations, at = block.stations, priors.station
+    mat = stations.mat_local_ins[at]
+    place = stations.place_m[at] + np.einsum("kij,kj->ki", mat, priors.arm_m) - priors.place_m
+    turn = frames.quat_log(frames.quat_from_mat(mat @ np.swapaxes(priors.mat_local_ins, 1, 2)))
+    return np.concatenate([place, turn], axis=1)
+
+
+def whitening(covariance: Array) -> Array:
+    """Matrices that make errors independent and of unit size, shape (k, 6, 6); rows of what nothing is known of are zero."""
+    out = np.zeros_like(covariance)
+    for number, one in enumerate(covariance):
+        known = np.flatnonzero(np.isfinite(np.diag(one)))
+        if len(known):
+            lower = np.linalg.cholesky(one[np.ix_(known, known)])
+            out[number][np.ix_(known, known)] = np.linalg.inv(lower)
+    return out
+
+
+def pose_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
+    """Weighted residuals, shape (k, 6), their derivatives, shape (k, 6, 7), and their columns, shape (k, 7), -1 for none.
+
+    The seventh column is the shift of the camera's clock: later images were taken elsewhere.
+    """
+    priors = block.priors
+    count = len(priors)
+    white = whitening(priors.covariance) * np.sqrt(priors.weight)[:, None, None]
+    by = np.zeros((count, POSE, POSE + 1))
+    arm = np.einsum("kij,kj->ki", block.stations.mat_local_ins[priors.station], priors.arm_m)
+    by[:, :3, :3], by[:, :3, 3:6], by[:, 3:, 3:6] = np.eye(3), -cross_matrix(arm), np.eye(3)
+    by[:, :3, 6], by[:, 3:, 6] = -priors.velocity_m_s, -priors.turning_rad_s
+    lead = block.stations.lead[priors.station]
+    shift = unknowns.camera[lead, lenses.FREE + MOUNTING.index("timeshift")]
+    columns = np.concatenate([unknowns.station[priors.station], shift[:, None]], axis=1)
+    residual = np.einsum("kij,kj->ki", white, pose_residuals(block, priors))
+    return residual, white @ by, columns
+
+
+def known_rows(block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns) -> tuple[Array, Array, Ints]:
+    """Weighted residuals, shape (k,), weights, shape (k,), and columns of values of cameras that were known before.
+
+    Parameters
+    ----------
+    block : Block
+    known : tuple of RigCamera
+        As they were before.
+    unknowns : Unknowns
+    """
+    residual, weight, columns = [], [], []
+    for number, (now, before) in enumerate(zip(block.rig.cameras, known, strict=True)):
+        for name, sigma, off in _known(now, before):
+            place = now.camera.place_of(name) if name in now.camera.names else lenses.FREE + MOUNTING.index(name)
+            column = unknowns.camera[number, place]
+            if column < 0 or column in columns:
+                continue
+            residual.append(off / sigma)
+            weight.append(1.0 / sigma)
+            columns.append(int(column))
+    return np.array(residual), np.array(weight), np.array(columns, np.int64)
+
+
+def _known(now: RigCamera, before: RigCamera) -> list[tuple[str, float, float]]:
+    """Name, prior sigma and departure of each value with a prior."""
+    found = []
+    values, old = now.camera.values(), before.camera.values()
+    found += [(name, before.sigma[name], values[name] - old[name]) for name in values if name in before.sigma]
+    turn = frames.quat_log(frames.quat_from_mat(now.mat_cam_ins @ before.mat_cam_ins.T))
+    lever = now.lever_arm_m - before.lever_arm_m
+    for what, off in (("boresight", turn), ("lever", lever)):
+        key, unit = PRIOR_UNIT[what]
+        if before.sigma.get(key):
+            found += [(f"{what}_{axis}", before.sigma[key] * unit, off[i]) for i, axis in enumerate("xyz")]
+    times = (
+        ("timeshift", now.timeshift_s - before.timeshift_s),
+        ("line_delay", now.line_delay_s - before.line_delay_s),
+    )
+    found += [(name, before.sigma[f"{name}_s"], off) for name, off in times if before.sigma.get(f"{name}_s")]
+    return found
+
+
+def add_dense(matrix: Array, gradient: Array, residual: Array, by: Array, columns: Ints) -> None:
+    """Add rows, (k, m), (k, m, c) with columns (k, c), to the normal matrix and the gradient."""
+    held = columns < 0
+    by = np.where(held[:, None, :], 0.0, by)
+    columns = np.where(held, 0, columns)
+    square = np.einsum("kmi,kmj->kij", by, by)
+    np.add.at(matrix, (columns[:, :, None], columns[:, None, :]), square)
+    np.add.at(gradient, columns, np.einsum("kmi,km->ki", by, residual))

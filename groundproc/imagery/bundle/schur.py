@@ -1,0 +1,232 @@
+"""Normal equations of a block with its points eliminated: S = U - W V^-1 W^T, never written down but for S.
+
+Points are worked one by one. A point's columns are those of the stations and cameras that see it; what it adds to S is a small dense
+matrix. A point that its rows leave undetermined adds nothing.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from groundproc.imagery import lenses
+from groundproc.imagery.bundle.block import POSE
+from groundproc.imagery.bundle.rows import System, row_of
+from groundproc.imagery.rig import MOUNTING
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+_POSE = POSE
+_OF_CAMERA = lenses.FREE + len(MOUNTING)
+_WEAKEST = 1e-13
+"""A point whose normal matrix is this much flatter in one direction than in another is not determined."""
+
+
+class Eliminated(NamedTuple):
+    """What is kept of the points for going back.
+
+    Attributes
+    ----------
+    inverse : ndarray, shape (p, 3, 3)
+        V^-1; zero where a point is not determined.
+    gradient : ndarray, shape (p, 3)
+    determined : ndarray of bool, shape (p,)
+    """
+
+    inverse: Array
+    gradient: Array
+    determined: Mask
+
+
+@njit(cache=True, nogil=True)
+def _known_of_point(system: System, p: int, point: Array, own: Array) -> None:
+    """Add what is known of a point without images."""
+    for i in range(system.first_row[p], system.first_row[p + 1]):
+        weight = system.row_root_weight[i]
+        left = -system.row_target_m[i]
+        for k in range(3):
+            left += system.row_normal[i, k] * point[k]
+        for j in range(3):
+            for k in range(3):
+                own[j, k] += weight * weight * system.row_normal[i, j] * system.row_normal[i, k]
+            own[j, 3] += weight * weight * system.row_normal[i, j] * left
+
+
+@njit(cache=True, nogil=True)
+def _column_at(columns: Ints, count: int, column: int) -> int:
+    """Place of a column among those of a point; `count` where it is new."""
+    for k in range(count):
+        if columns[k] == column:
+            return k
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _add_row(
+    value: Array, by_point: Array, residual: float, place: Ints, mixed: Array, own: Array, camera_side: Array
+) -> None:
+    """Add the products of one row: `value` (used,) in the columns at `place`, `by_point` (3,)."""
+    for j in range(len(place)):
+        at, v = place[j], value[j]
+        for k in range(3):
+            mixed[at, k] += v * by_point[k]
+        for k in range(len(place)):
+            camera_side[at, place[k]] += v * value[k]
+        camera_side[at, -1] += v * residual
+    for j in range(3):
+        for k in range(3):
+            own[j, k] += by_point[j] * by_point[k]
+        own[j, 3] += by_point[j] * residual
+
+
+@njit(cache=True, nogil=True)
+def _point_system(
+    system: System, p: int, point: Array, columns: Ints, mixed: Array, own: Array, camera_side: Array
+) -> int:
+    """Sums of one point: own (3, 4) is V and its gradient, mixed (m, 3) is W, camera_side (m, m + 1) is U and its gradient; returns m.
+
+    `columns` (m,) are the columns of the reduced system that the rows of this point have.
+    """
+    own[:] = 0.0
+    count = 0
+    residual = np.zeros(2)
+    by_pose, by_point, by_camera = np.zeros((2, _POSE)), np.zeros((2, 3)), np.zeros((2, _OF_CAMERA))
+    place = np.empty(_POSE + _OF_CAMERA, np.int64)
+    value = np.empty((2, _POSE + _OF_CAMERA))
+    for i in range(system.first[p], system.first[p + 1]):
+        if not row_of(system, i, point, residual, by_pose, by_point, by_camera):
+            continue
+        image = system.image[i]
+        station, camera = system.station[image], system.camera[image]
+        used = 0
+        for j in range(_POSE + _OF_CAMERA):
+            column = system.station_column[station, j] if j < _POSE else system.camera_column[camera, j - _POSE]
+            if column < 0:
+                continue
+            at = _column_at(columns, count, column)
+            if at == count:
+                columns[at] = column
+                mixed[at] = 0.0
+                camera_side[at, : count + 1] = 0.0
+                camera_side[: count + 1, at] = 0.0
+                camera_side[at, -1] = 0.0
+                count += 1
+            place[used] = at
+            for a in range(2):
+                value[a, used] = by_pose[a, j] if j < _POSE else by_camera[a, j - _POSE]
+            used += 1
+        for a in range(2):
+            _add_row(value[a, :used], by_point[a], residual[a], place[:used], mixed, own, camera_side)
+    _known_of_point(system, p, point, own)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def inverted(own: Array, damping: float, out: Array) -> bool:
+    """Inverse of a symmetric matrix (3, 3) with its diagonal raised by a share; False where it is flat."""
+    a, b, c = own[0, 0] * (1.0 + damping), own[1, 1] * (1.0 + damping), own[2, 2] * (1.0 + damping)
+    d, e, f = own[0, 1], own[1, 2], own[0, 2]
+    m00, m01, m02 = b * c - e * e, f * e - d * c, d * e - f * b
+    determinant = a * m00 + d * m01 + f * m02
+    scale = max(a, b, c)
+    out[:] = 0.0
+    if not determinant > _WEAKEST * scale * scale * scale:
+        return False
+    out[0, 0], out[0, 1], out[0, 2] = m00 / determinant, m01 / determinant, m02 / determinant
+    out[1, 0], out[1, 1], out[1, 2] = out[0, 1], (a * c - f * f) / determinant, (d * f - a * e) / determinant
+    out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], (a * b - d * d) / determinant
+    return True
+
+
+@njit(cache=True, nogil=True)
+def widest(system: System) -> int:
+    """Columns that the rows of one point can have."""
+    most = 0
+    for p in range(len(system.first) - 1):
+        most = max(most, system.first[p + 1] - system.first[p])
+    return int(most * _POSE + np.count_nonzero(system.camera_column >= 0))
+
+
+@njit(cache=True, nogil=True)
+def reduce(system: System, points: Array, damping: float, matrix: Array, gradient: Array, kept: Eliminated) -> None:
+    """Add the rows of all points to the reduced normal matrix (n, n) and its gradient (n,); fill what is kept."""
+    size = min(widest(system), len(gradient))
+    columns, mixed = np.empty(size, np.int64), np.empty((size, 3))
+    own, camera_side = np.empty((3, 4)), np.empty((size, size + 1))
+    carried = np.empty((size, 3))
+    for p in range(len(points)):
+        count = _point_system(system, p, points[p], columns, mixed, own, camera_side)
+        kept.determined[p] = inverted(own, damping, kept.inverse[p])
+        kept.gradient[p] = own[:, 3]
+        if not kept.determined[p]:
+            continue
+        inverse = kept.inverse[p]
+        for j in range(count):
+            for k in range(3):
+                carried[j, k] = mixed[j, 0] * inverse[0, k] + mixed[j, 1] * inverse[1, k] + mixed[j, 2] * inverse[2, k]
+        for j in range(count):
+            row = columns[j]
+            gradient[row] += camera_side[j, -1] - (
+                carried[j, 0] * own[0, 3] + carried[j, 1] * own[1, 3] + carried[j, 2] * own[2, 3]
+            )
+            for k in range(count):
+                matrix[row, columns[k]] += camera_side[j, k] - (
+                    carried[j, 0] * mixed[k, 0] + carried[j, 1] * mixed[k, 1] + carried[j, 2] * mixed[k, 2]
+                )
+
+
+@njit(cache=True, nogil=True)
+def back(system: System, points: Array, kept: Eliminated, step: Array, out: Array) -> None:
+    """Steps of the points, shape (p, 3), that belong to a step of the reduced system, shape (n,)."""
+    size = min(widest(system), len(step))
+    columns, mixed = np.empty(size, np.int64), np.empty((size, 3))
+    own, camera_side = np.empty((3, 4)), np.empty((size, size + 1))
+    right = np.empty(3)
+    for p in range(len(points)):
+        out[p] = 0.0
+        if not kept.determined[p]:
+            continue
+        count = _point_system(system, p, points[p], columns, mixed, own, camera_side)
+        for k in range(3):
+            right[k] = -kept.gradient[p, k]
+            for j in range(count):
+                right[k] -= mixed[j, k] * step[columns[j]]
+        for k in range(3):
+            for j in range(3):
+                out[p, k] += kept.inverse[p, k, j] * right[j]
+
+
+@njit(cache=True, nogil=True)
+def point_cofactors(system: System, points: Array, kept: Eliminated, cofactor: Array, out: Array) -> None:
+    """Cofactors of the points, shape (p, 3, 3), from those of the reduced system, shape (n, n): V^-1 + V^-1 W^T Q W V^-1."""
+    size = min(widest(system), len(cofactor))
+    columns, mixed = np.empty(size, np.int64), np.empty((size, 3))
+    own, camera_side = np.empty((3, 4)), np.empty((size, size + 1))
+    carried, moved = np.empty((size, 3)), np.empty(3)
+    for p in range(len(points)):
+        out[p] = np.nan
+        if not kept.determined[p]:
+            continue
+        count = _point_system(system, p, points[p], columns, mixed, own, camera_side)
+        inverse = kept.inverse[p]
+        out[p] = inverse
+        for j in range(count):
+            for k in range(3):
+                carried[j, k] = mixed[j, 0] * inverse[0, k] + mixed[j, 1] * inverse[1, k] + mixed[j, 2] * inverse[2, k]
+        for j in range(count):
+            moved[:] = 0.0
+            for k in range(count):
+                share = cofactor[columns[j], columns[k]]
+                for a in range(3):
+                    moved[a] += share * carried[k, a]
+            for a in range(3):
+                for b in range(3):
+                    out[p, a, b] += carried[j, a] * moved[b]
+
+
+def nothing_kept(points: int) -> Eliminated:
+    """Empty arrays to be filled."""
+    return Eliminated(np.zeros((points, 3, 3)), np.zeros((points, 3)), np.zeros(points, np.bool_))
