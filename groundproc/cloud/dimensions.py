@@ -162,6 +162,7 @@ TABLE: Final = (
     Dimension(
         "reflectance_sigma", "f4", "sigma of reflectance", "One standard deviation of the reflectance.", "`swath reflectance`",
     ),
+    Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),
 )  # fmt: skip
 """All columns that points may have, in the order of the file and of the documentation."""
 

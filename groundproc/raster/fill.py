@@ -1,8 +1,8 @@
 """Empty cells filled from those around them: a membrane through what is known, by a pyramid of ever larger cells.
 
-The membrane is the surface of least slope (Laplace's equation) whose known cells stay as they are. Each level of the pyramid is the mean of
-the known cells of the finer one; the coarsest is solved first, and each finer level starts from it and needs few sweeps. Work and memory grow
-with the number of cells, where a direct solution grows faster.
+The membrane is the surface of least slope (Laplace's equation) whose known cells stay as they are. Each level of the pyramid is the mean
+of the known cells of the finer one; the coarsest is solved first, and each finer level starts from it and needs few sweeps. Work and
+memory grow with the number of cells, where a direct solution grows faster.
 """
 
 from typing import Any, Final

@@ -1,7 +1,7 @@
-"""Grey-scale openings of rasters by octagons of growing radius: what is narrower than twice the radius is levelled down to its surroundings.
+"""Grey-scale openings of rasters by octagons: what is narrower than twice the radius is levelled down to its surroundings.
 
-An octagon is a square and a diamond by turns, close to a disc, and decomposes into lines: a minimum along a line costs three comparisons a cell
-whatever its length (van Herk 1992). Octagons of growing radius are each open with respect to the next, so an opening need not start anew.
+An octagon, close to a disc, is a square widened by a diamond, and decomposes into lines: a minimum along a line costs three comparisons a
+cell whatever its length (van Herk 1992).
 """
 
 from typing import Any
@@ -38,28 +38,31 @@ def eroded(surface: Raster, radius: int) -> Raster:
 
 
 def _parts(radius: int) -> tuple[int, int]:
-    """Half sides of the square and the diamond whose sum is an octagon of that radius: a diamond reaches its half side along the axes alone.
-
-    For a regular octagon the square takes tan(22.5 deg) of the radius.
-    """
-    square = int(round(0.4142 * radius))
+    """Half sides of the square and of the diamond; in a regular octagon the square takes tan(22.5 deg) of the radius."""
+    square = round(0.4142 * radius)
     if radius == 1:
         square = 0
     return square, radius - square
 
 
 def _octagon(surface: Raster, square: int, diamond: int, highest: bool) -> Raster:
-    values = np.ascontiguousarray(-surface if highest else surface, np.float32)
+    # lines may lead out of the raster and back into it
+    margin = square + diamond
+    rows, columns = surface.shape
+    values = np.full((rows + 2 * margin, columns + 2 * margin), np.inf, np.float32)
+    inner = (slice(margin, margin + rows), slice(margin, margin + columns))
+    values[inner] = -surface if highest else surface
     if square:
         values = _along_rows(values, square)
         values = np.ascontiguousarray(_along_rows(np.ascontiguousarray(values.T), square).T)
-    # a diamond of half side n from two diagonal lines has holes like a chess board; the small cross closes them
-    if diamond > 1:
-        values = _along_diagonals(values, (diamond - 1 + 1) // 2, 1)
-        values = _along_diagonals(values, (diamond - 1) // 2, -1)
-    if diamond:
+    # two diagonal lines make a diamond with holes like a chess board; a small cross closes them, and adds one to its half side
+    half = max(diamond - 1, 0) // 2
+    if half:
+        values = _along_diagonals(_along_diagonals(values, half, 1), half, -1)
+    for _ in range(diamond - 2 * half):
         values = _cross(values)
-    return -values if highest else values
+    found = values[inner]
+    return -found if highest else np.ascontiguousarray(found)
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,8 @@
+"""Bare ground from clouds, on rasters of the lowest points.
+
+settings     what the filter goes by, presets for kinds of terrain, and what follows from the cloud itself
+filter       which of the lowest points are ground: openings of growing size above ground that was smoothed away, thresholds from its relief
+holdout      how well heights of ground that were left out are met
+building     roofs: planes that stand above the ground with steps around them, and their outlines
+surfaces     rasters of whole areas, block by block, on the disk
+"""

@@ -1,0 +1,111 @@
+"""Roofs: what stands well above the ground and is a plane over some metres, cell by cell, and the outlines of it."""
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import rasterio.features
+import shapely
+from numba import njit
+from rasterio.transform import Affine
+from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label
+
+from groundproc.raster.grid import Grid
+
+Raster = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+LEAST_HEIGHT_M: Final = 2.0
+"""Eaves of a house stand higher."""
+LEAST_AREA_M2: Final = 12.0
+_AROUND_M: Final = 1.25
+"""Half side of the square that has to be a plane."""
+_ROUGH_M: Final = 0.12
+"""A crown of leaves deviates from its best plane by some decimetres, tiles and noise by less than a tenth of that."""
+_STEEPEST: Final = 1.8
+_EDGE_CELLS: Final = 2
+"""A plane cannot be told so near to the edge of a roof, where walls and what hangs over share its cells."""
+_FEWEST: Final = 6
+"""Cells of a plane."""
+
+
+def roofs(top_m: Raster, ground_m: Raster, cell_m: float) -> Mask:
+    """Cells of buildings.
+
+    Parameters
+    ----------
+    top_m : ndarray of float32, shape (rows, columns)
+        Highest point of each cell; NaN without any.
+    ground_m : ndarray of float32, shape (rows, columns)
+    cell_m : float
+    """
+    high = np.isfinite(top_m) & (top_m - ground_m > LEAST_HEIGHT_M)
+    half = max(round(_AROUND_M / cell_m), 1)
+    rough, steep = _planes(np.where(high, top_m, np.float32(np.nan)), half, cell_m)
+    plane = high & (rough < _ROUGH_M) & (steep < _STEEPEST)
+    body = _large(binary_opening(plane, np.ones((2, 2), np.bool_)), LEAST_AREA_M2 / 2.0 / cell_m**2)
+    grown = binary_closing(np.pad(body, half), np.ones((3, 3), np.bool_), iterations=half)[half:-half, half:-half]
+    grown = binary_fill_holes(grown) & (high | ~np.isfinite(top_m))
+    for _ in range(_EDGE_CELLS):
+        grown = _joined_edges(grown, top_m, high)
+    return _large(grown, LEAST_AREA_M2 / cell_m**2)
+
+
+def _joined_edges(body: Mask, top_m: Raster, high: Mask) -> Mask:
+    """The body and those high cells beside it that are as high as one of it: a roof's own edge."""
+    out = body.copy()
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        beside, height = np.roll(body, step, axis), np.roll(top_m, step, axis)
+        out |= beside & high & (np.abs(height - top_m) < 0.5)
+    return out
+
+
+def _large(mask: Mask, cells: float) -> Mask:
+    """Pieces of so many cells at least."""
+    number, _ = label(mask)
+    size = np.bincount(number.ravel())
+    size[0] = 0
+    return np.asarray((size >= cells)[number])
+
+
+def outlines(mask: Mask, grid: Grid) -> list[Any]:
+    """Outlines of pieces, as polygons whose edges do not follow the steps of the cells."""
+    transform = Affine(grid.cell_m, 0.0, grid.west_m, 0.0, -grid.cell_m, grid.north_m)
+    found = []
+    for shape, _ in rasterio.features.shapes(mask.astype(np.uint8), mask, connectivity=4, transform=transform):
+        polygon = shapely.geometry.shape(shape).simplify(0.75 * grid.cell_m)
+        if not polygon.is_empty and polygon.geom_type == "Polygon":
+            found.append(polygon)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _planes(top: Any, half: int, cell_m: float) -> Any:
+    """Deviation of the highest points around each cell from their best plane [m], and its slope; infinite with too few."""
+    rows, columns = top.shape
+    rough, steep = np.full((rows, columns), np.inf, np.float32), np.full((rows, columns), np.inf, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            if not np.isfinite(top[i, j]):
+                continue
+            n, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for a in range(max(i - half, 0), min(i + half + 1, rows)):
+                for b in range(max(j - half, 0), min(j + half + 1, columns)):
+                    z = top[a, b] - top[i, j]
+                    # what stands a storey higher or lower is another roof, or the street
+                    if np.isfinite(z) and abs(z) < 2.5:
+                        x, y = (b - j) * cell_m, (a - i) * cell_m
+                        n, sx, sy, sz = n + 1.0, sx + x, sy + y, sz + z
+                        sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                        sxz, syz, szz = sxz + x * z, syz + y * z, szz + z * z
+            if n < _FEWEST:
+                continue
+            cxx, cxy, cyy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+            cxz, cyz, czz = sxz - sx * sz / n, syz - sy * sz / n, szz - sz * sz / n
+            det = cxx * cyy - cxy * cxy
+            if det < 1e-6 * (cxx + cyy) ** 2:
+                continue
+            p, q = (cxz * cyy - cyz * cxy) / det, (cyz * cxx - cxz * cxy) / det
+            rough[i, j] = np.sqrt(max(czz - p * cxz - q * cyz, 0.0) / max(n - 3.0, 1.0))
+            steep[i, j] = np.sqrt(p * p + q * q)
+    return rough, steep

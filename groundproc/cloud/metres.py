@@ -1,0 +1,63 @@
+"""Clouds in metres, whatever unit their CRS has: feet at the door become metres, and results go back into the unit of the CRS."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.errors import GeodesyError
+from groundproc.cloud.reader import Cloud
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Metres:
+    """Metres in one unit of a CRS.
+
+    Attributes
+    ----------
+    across, up : float
+        Of its coordinates, and of its heights.
+    """
+
+    across: float = 1.0
+    up: float = 1.0
+
+    @property
+    def plain(self) -> bool:
+        """The CRS is in metres."""
+        return self.across == self.up == 1.0
+
+    def of(self, xyz: Array) -> Array:
+        """Coordinates of the CRS in metres, shape (n, 3)."""
+        return xyz if self.plain else xyz * (self.across, self.across, self.up)
+
+    def back(self, xyz_m: Array) -> Array:
+        """Metres in units of the CRS, shape (n, 3)."""
+        return xyz_m if self.plain else xyz_m / (self.across, self.across, self.up)
+
+
+def metres_of(cloud: Cloud) -> Metres:
+    """The unit of a cloud; one that states no CRS is in metres.
+
+    Raises
+    ------
+    GeodesyError
+        Its coordinates are angles.
+    """
+    crs = cloud.horizontal
+    if crs is None:
+        return Metres()
+    if crs.is_geographic:
+        raise GeodesyError(
+            f"{cloud.path}: is in {crs.name}, whose coordinates are degrees; expected a projected CRS, such as a UTM zone"
+        )
+    across = float(crs.axis_info[0].unit_conversion_factor) if crs.axis_info else 1.0
+    whole = cloud.crs
+    up = across
+    if whole is not None and whole.is_compound:
+        up = float(whole.sub_crs_list[1].axis_info[0].unit_conversion_factor)
+    elif whole is not None and len(whole.axis_info) > 2:
+        up = float(whole.axis_info[2].unit_conversion_factor)
+    return Metres(across, up)
