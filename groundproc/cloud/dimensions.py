@@ -163,6 +163,7 @@ TABLE: Final = (
         "reflectance_sigma", "f4", "sigma of reflectance", "One standard deviation of the reflectance.", "`swath reflectance`",
     ),
     Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),
+    Dimension("clearance", "f4", "to the nearest wire", "Distance to the nearest wire.", "wires", "m"),
 )  # fmt: skip
 """All columns that points may have, in the order of the file and of the documentation."""
 

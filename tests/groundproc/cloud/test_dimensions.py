@@ -16,7 +16,7 @@ from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
 
 START_NS = 1_779_272_223_000_000_000
-TOY = Dimension("hag", "u2", "above ground", "Height above the ground below.", "a toy", "m", 0.01, no_data=65_535)
+TOY = Dimension("depth", "u2", "above ground", "Height above the ground below.", "a toy", "m", 0.01, no_data=65_535)
 
 STANDARD = {
     "intensity": ("u2", 0), "return_number": ("u1", 4), "number_of_returns": ("u1", 4), "classification": ("u1", 0),
@@ -98,17 +98,17 @@ def test_what_was_written_comes_back_in_the_tables_units(table: tuple[Dimension,
 def test_an_attribute_is_one_entry_and_the_stage_that_fills_it(table: tuple[Dimension, ...], tmp_path: Path) -> None:
     placed = Points(np.full(3, START_NS), np.zeros((3, 3)), {"intensity": np.ones(3, np.uint8)})
     assert table[-1] is TOY
-    with pytest.raises(UsageError, match=r"hag \(above ground\) .* which have intensity; a toy fills it"):
-        placed["hag"]
-    filled = placed.with_columns(hag=np.array([0.0, 12.34, np.nan], np.float32))
+    with pytest.raises(UsageError, match=r"depth \(above ground\) .* which have intensity; a toy fills it"):
+        placed["depth"]
+    filled = placed.with_columns(depth=np.array([0.0, 12.34, np.nan], np.float32))
     with CloudWriter(tmp_path / "a.laz", filled.columns) as cloud:
         cloud.write(filled)
     stored = laspy.read(tmp_path / "a.laz")
-    assert stored.points.array["hag"].tolist() == [0, 1234, 65_535]
+    assert stored.points.array["depth"].tolist() == [0, 1234, 65_535]
     # only what something fills is written
-    assert [found.name for found in stored.point_format.extra_dimensions] == ["hag"]
+    assert [found.name for found in stored.point_format.extra_dimensions] == ["depth"]
     (chunk,) = reader.chunks(reader.look(tmp_path / "a.laz"))
-    np.testing.assert_array_equal(chunk.points["hag"], filled["hag"])
+    np.testing.assert_array_equal(chunk.points["depth"], filled["depth"])
 
 
 def test_names_are_unique_and_unknown_ones_are_our_mistake() -> None:
@@ -128,4 +128,4 @@ def test_points_are_masked_together() -> None:
     assert some.time_ns.tolist() == some["laser"].tolist() == some["range"].tolist() == [1, 3]
     assert some.xyz_m.tolist() == [[3.0, 4.0, 5.0], [9.0, 10.0, 11.0]]
     assert "laser" in some
-    assert "hag" not in some
+    assert "depth" not in some
