@@ -136,8 +136,9 @@ TABLE: Final = (
         "classification", "u1", "class", "ASPRS class; 0 is never classified.", "other programs", field="classification",
     ),
     Dimension(
-        "scan_angle", "i2", "scan angle", "Angle of the beam off the vertical across the line of flight.", "other programs", "deg", 0.006,
-        "scan_angle",
+        "scan_angle", "i2", "scan angle",
+        "Angle of the beam off the vertical across the line of flight, right positive; where the aircraft stands, across the way that "
+        "the sensor looks.", "attributes", "deg", 0.006, "scan_angle",
     ),
     Dimension("user_data", "u1", "user data", "What another program used it for.", "other programs", field="user_data"),
     Dimension(
@@ -154,6 +155,18 @@ TABLE: Final = (
         "decoding", "deg", 0.01,
     ),
     Dimension("range", "u2", "range", "Distance from the sensor as measured, before corrections of the laser.", "sensor", "m", 0.002),
+    Dimension(
+        "incidence", "u1", "incidence", "Angle between the beam and the normal of the surface around the point; none where there is none.",
+        "attributes", "deg", 1.0, no_data=255,
+    ),
+    Dimension(
+        "sigma_h", "u2", "sigma horizontal", "How well its place is known, one sigma of each horizontal axis; the GNSS is in it.",
+        "attributes", "m", 0.001, no_data=65535,
+    ),
+    Dimension(
+        "sigma_v", "u2", "sigma vertical", "How well its height is known, one sigma; the GNSS is in it.", "attributes", "m", 0.001,
+        no_data=65535,
+    ),
     Dimension(
         "reflectance", "f4", "diffuse reflectance",
         "Share of the light that a surface throws back, as a white Lambertian one throws back all; not a number where the echo is of a "

@@ -1,6 +1,6 @@
 """The stage that makes the cloud: every shot given its pose, placed, projected and handed on; and what became of each."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -40,21 +40,24 @@ class Sink(Protocol):
         """All points were given."""
 
 
-def place(
-    shots: Iterable[Shots],
-    trajectory: Trajectory,
-    mount: Mount,
-    projection: geodesy.Projection,
-    sinks: Sequence[Sink],
+def placed(shots: Iterable[Shots], trajectory: Trajectory, mount: Mount) -> Iterator[Points]:
+    """Shots, with times in UTC, as points of the flight's frame, piece by piece; those of a piece may be none."""
+    for some in shots:
+        yield without_strays(georeference.georeference(some, trajectory, mount))
+        del some  # the next piece takes its memory
+
+
+def handed_on(
+    pieces: Iterable[Points], trajectory: Trajectory, projection: geodesy.Projection, sinks: Sequence[Sink]
 ) -> Placed:
-    """Place and project all shots, and hand the points to the sinks, piece by piece.
+    """Project points of the flight's frame and hand them to the sinks, piece by piece.
 
     Parameters
     ----------
-    shots : iterable of Shots
-        With times in UTC.
+    pieces : iterable of Points
+        Their places are written over.
     trajectory : Trajectory
-    mount : Mount
+        That they were placed with.
     projection : geodesy.Projection
         From the trajectory's frame.
     sinks : sequence of Sink
@@ -67,15 +70,14 @@ def place(
     for sink in sinks:
         sink.begin()
     count, dropped = 0, Dropped()
-    for some in shots:
-        points = without_strays(georeference.georeference(some, trajectory, mount))
+    for points in pieces:
         dropped = dropped + points.dropped
         if len(points):
             count += len(points)
             project(points, projection)
             for sink in sinks:
                 sink.add(points)
-        del some, points  # the next piece takes their memory
+        del points  # the next piece takes their memory
     if not count:
         raise CoverageError(f"not one shot gives a point: {_why_nothing(dropped, trajectory)}")
     for sink in sinks:

@@ -14,8 +14,11 @@ import numpy.typing as npt
 
 from flightlog import records
 from flightlog.constants import NS_PER_S
-from groundproc.sensors.model import Digest, Records, Times
+from groundproc.sensors.model import Digest, Ranging, Records, Times
 from groundproc.sensors.shots import SINGLE_RETURN, Gate, Gated, LaserTable, Shots
+
+RANGING: Final = Ranging(sigma_m=0.03, divergence_rad=11e-3, pulse_m=1.0)
+"""Of scanners of the source's class, by their data sheets (SICK LMS 291: 3 cm, 11 mrad): lines do not state it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +29,7 @@ class LineScanner:
     topic: str = records.LINE_SCAN.topic
     about: str = "line scanner"
     range_step_m: float = 0.0
+    ranging: Ranging = RANGING
     firing_ns: int = 0
     laser_ns: int = 0
     idle_ns: int = 0

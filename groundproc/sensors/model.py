@@ -16,6 +16,25 @@ Records = npt.NDArray[np.void]
 Times = npt.NDArray[np.int64]
 
 
+@dataclass(frozen=True, slots=True)
+class Ranging:
+    """What a beam knows of its echo.
+
+    Attributes
+    ----------
+    sigma_m : float
+        Of a range at normal incidence, one sigma.
+    divergence_rad : float
+        Full width of the beam.
+    pulse_m : float
+        Length of the pulse, as the distance from which on two surfaces give two echoes.
+    """
+
+    sigma_m: float
+    divergence_rad: float
+    pulse_m: float
+
+
 class Lidar(Protocol):
     """One model of lidar.
 
@@ -29,6 +48,7 @@ class Lidar(Protocol):
         For the header of a cloud, at most 31 characters with what follows it.
     range_step_m : float
         What ranges are whole multiples of; 0: they are not.
+    ranging : Ranging
     lasers : LaserTable
         The manual's.
     firing_ns, laser_ns : int
@@ -47,6 +67,7 @@ class Lidar(Protocol):
     topic: str
     about: str
     range_step_m: float
+    ranging: Ranging
     lasers: LaserTable
     firing_ns: int
     laser_ns: int

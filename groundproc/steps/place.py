@@ -2,17 +2,21 @@
 
 import contextlib
 import functools
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CoverageError, LogError, UsageError
 from groundproc import geodesy
-from groundproc.cloud import placing
+from groundproc.cloud import attributes, placing
+from groundproc.cloud.points import Points
+from groundproc.cloud.pointsigma import MountErrors
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.shots import Tally, shots
 from groundproc.flight.timeline import tied
@@ -25,16 +29,17 @@ from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
-from groundproc.survey import PlacingSettings, Survey, section
+from groundproc.survey import AttributeSettings, PlacingSettings, Survey, section
+from groundproc.trajectory.estimate import Estimate
 
 FOUND: Final = f"{INSIDE}/place.json"
 """What quality.json says of shots and points."""
 
 
 def settings(request: Request) -> Mapping[str, Any]:
-    """The window of shots, the CRS, and what heights refer to."""
+    """The window of shots, what is said of each point, the CRS, and what heights refer to."""
     survey = request.survey
-    return section(survey, PlacingSettings) | {
+    return section(survey, PlacingSettings, AttributeSettings) | {
         "crs": survey.crs,
         "crs_anyway": survey.crs_anyway,
         "height": survey.height,
@@ -50,6 +55,7 @@ def check(request: Request) -> None:
     """Refuse what cannot be, or would not be used, before the work, not after."""
     survey = request.survey
     chosen(survey.products)
+    attributes.wanted(survey.attributes)
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)
     elif survey.crs_anyway:
@@ -80,12 +86,18 @@ def work(run: Run, folders: Folders) -> None:
     latitude, longitude, _ = made.trajectory.frame.to_geodetic(made.trajectory.position_m)
     check_place(run.survey, latitude, longitude)
     projection = projection_of(made.trajectory.frame, run.survey)
-    survey, tally = run.survey, Tally()
+    survey, tally, lidar = run.survey, Tally(), lidar_of(run.readers)
     context = Context(run.folder, run.folder, survey, made, projection, inputs=run.names)
-    lidar = lidar_of(run.readers)
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
-    lasers, told = made.corrections.table(lidar.lasers), functools.partial(run.progress, "place")
-    seen = shots(run.readers, timeline, gate, lasers, tally, told)
+    lasers, names = made.corrections.table(lidar.lasers), attributes.wanted(survey.attributes)
+    told = shared(functools.partial(run.progress, "place"), attributes.passes(names))
+    tallies = itertools.chain([tally], iter(Tally, None))  # the packets of a second pass are the same ones
+
+    def stream() -> Iterator[Points]:
+        seen = shots(run.readers, timeline, gate, lasers, next(tallies), told)
+        return placing.placed(seen, made.trajectory, made.mount)
+
+    scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging)
     with contextlib.ExitStack() as stack:
         sinks: list[Making] = []
         for each in chosen(survey.products):
@@ -93,7 +105,8 @@ def work(run: Run, folders: Folders) -> None:
                 own = replace(context, folder=folders[each.name])
                 sinks += stack.enter_context(streamed([each], own))
         try:
-            placed = placing.place(seen, made.trajectory, made.mount, projection, sinks)
+            described = attributes.described(stream, scene, names)
+            placed = placing.handed_on(described, made.trajectory, projection, sinks)
         except CoverageError:
             if tally.packets:
                 raise
@@ -102,6 +115,29 @@ def work(run: Run, folders: Folders) -> None:
             ) from None
     if WHOLE in folders:
         _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed)
+
+
+def mount_errors(made: Estimate, survey: Survey) -> MountErrors:
+    """How well the mount is known, where the sigmas of the poses do not hold that already.
+
+    Where poses and mount are estimated together, from the lidar itself, their errors take each other away in the cloud.
+    """
+    worse = made.figures.get("adjustment.is_worse")
+    if made.mount_sigma is not None or (worse is not None and not worse):
+        return MountErrors(np.zeros(3), np.zeros(3))
+    return MountErrors(np.full(3, np.deg2rad(survey.boresight_sigma_deg)), np.zeros(3))
+
+
+def shared(told: Callable[[int], None], passes: int) -> Callable[[int], None]:
+    """Tell of the bytes of several passes as if they were one."""
+    left = 0
+
+    def tell(done: int) -> None:
+        nonlocal left
+        whole, left = divmod(left + done, passes)
+        told(whole)
+
+    return tell
 
 
 def _tell(path: Path, lidar: Lidar, projection: geodesy.Projection, tally: Tally, placed: placing.Placed) -> None:

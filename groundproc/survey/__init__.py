@@ -145,6 +145,29 @@ class PlacingSettings:
 
 
 @dataclass(frozen=True)
+class AttributeSettings:
+    """Attributes: what is said of each point beside its place."""
+
+    attributes: tuple[str, ...] | None = setting(
+        None,
+        "what is found out of each point: scan_angle, incidence, sigma; see docs/attributes.md",
+        words=("--attributes",),
+        metavar="NAMES",
+        reads="names",
+        absent="all",
+        in_file="a list; [] for none",
+    )
+    boresight_sigma_deg: float = setting(
+        0.5,
+        "how well the angles of a mount that is not estimated are known, one sigma; it is in the sigma of points",
+        words=("--boresight-sigma-deg",),
+        metavar="DEG",
+        minimum=0,
+        maximum=20,
+    )
+
+
+@dataclass(frozen=True)
 class OutputSettings:
     """Output: which products, and their coordinates and heights."""
 
@@ -179,11 +202,11 @@ class OutputSettings:
 
 
 @dataclass(frozen=True)
-class Survey(OutputSettings, PlacingSettings, TrajectorySettings, ClockSettings, MountSettings):
+class Survey(OutputSettings, AttributeSettings, PlacingSettings, TrajectorySettings, ClockSettings, MountSettings):
     """All that can be chosen: the options of `swath process`."""
 
 
-SECTIONS: Final = (MountSettings, ClockSettings, TrajectorySettings, PlacingSettings, OutputSettings)
+SECTIONS: Final = (MountSettings, ClockSettings, TrajectorySettings, PlacingSettings, AttributeSettings, OutputSettings)
 """In the order of the flight from log to products."""
 FILES: Final = ("mount", "positions", "poses", "control", "lasers", "compass")
 """Options that name a file, looked for beside survey.yaml."""

@@ -20,7 +20,8 @@ TYPED = {
     "control": (["--control", "c.csv"], "c.csv"), "lasers": (["--lasers", "estimate"], "estimate"),
     "compass": (["--compass", "c.yaml"], "c.yaml"), "pose_grid_ms": (["--pose-grid-ms", "10ms"], 10.0),
     "fov_deg": (["--fov-deg=-105:105"], (-105.0, 105.0)), "min_range_m": (["--min-range-m", "2.5"], 2.5),
-    "max_range_m": (["--max-range-m", "50"], 50.0), "crs": (["--epsg", "EPSG:3006"], "EPSG:3006"),
+    "max_range_m": (["--max-range-m", "50"], 50.0), "attributes": (["--attributes", "sigma"], ("sigma",)),
+    "boresight_sigma_deg": (["--boresight-sigma-deg", "0.1"], 0.1), "crs": (["--epsg", "EPSG:3006"], "EPSG:3006"),
     "crs_anyway": (["--crs-anyway"], True), "height": (["--height", "relative"], "relative"), "geoid": (["--geoid", "29.35"], "29.35"),
     "products": (["--products", "cloud.laz, pictures"], ("cloud.laz", "pictures")),
 }  # fmt: skip

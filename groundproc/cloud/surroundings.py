@@ -1,0 +1,383 @@
+"""What lies around each point: the points of a stretch of flight in voxels, with their moments, and the plane that each voxel lies in.
+
+A voxel's plane is that of the cube of a metre around it, or of half a metre, or its own: the first that is flat and passes through its
+points. Beside an edge it is that of a flat neighbour; where points are sparse that of the cube of four metres. What no plane fits has
+none: leaves, wires, single points.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from groundproc.numerics.planes import flattest
+from groundproc.numerics.voxelhash import spread, voxel_key
+
+Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+Ints = npt.NDArray[np.int32]
+Single = npt.NDArray[np.float32]
+
+EDGE_M: Final = 0.25
+LEVELS: Final = 4
+"""Larger voxels: each level has twice the edge of the one before."""
+_ORDER: Final = (2, 1, 0)
+"""Levels that are asked for a plane, in this order, before the neighbours are; the largest are asked last."""
+MOST: Final = 4_000_000
+"""Voxels of a stretch of flight: some 400 MB."""
+MOST_POINTS: Final = 4096
+"""Points of a voxel that its moments are made of: a hover adds nothing more."""
+_BEGIN: Final = 1 << 16
+_MASK: Final = 0x1FFFFF
+_FLAT_M: Final = 0.03
+_FLAT_SHARE: Final = 0.03
+"""RMS off the plane of what counts as flat: the sensor's noise and that of a path that knows where it is, and so much of the edge."""
+_FEWEST: Final = 6
+_SLOPE: Final = 0.04
+"""Points of a plane; and how well they must tell its slope [rad], one sigma."""
+_NEAR_M: Final = 0.05
+"""How far off a plane the points of a voxel may lie that it is said of."""
+
+
+class Voxels(NamedTuple):
+    """Voxels in the order in which they were met, as kernels take them; arrays are longer than what is used.
+
+    Attributes
+    ----------
+    key : ndarray of int64, shape (n,)
+    many : ndarray of int32, shape (n,)
+        Points.
+    sums : ndarray of float32, shape (n, 10)
+        How many points the sums are of; sums of x, y, z, xx, xy, xz, yy, yz, zz from the middle of the voxel [m, m^2].
+    when_ms : ndarray of int32, shape (n, 2)
+        First and last time of a point, from the begin of the stretch.
+    farthest_m : ndarray of float32, shape (n,)
+        Largest range of a point.
+    normal : ndarray of float32, shape (n, 3)
+        Unit vector; zero where there is no plane.
+    """
+
+    key: Times
+    many: Ints
+    sums: Single
+    when_ms: Ints
+    farthest_m: Single
+    normal: Single
+
+    @classmethod
+    def empty(cls, size: int) -> "Voxels":
+        """Room for so many."""
+        return cls(
+            np.zeros(size, np.int64), np.zeros(size, np.int32), np.zeros((size, 10), np.float32),
+            np.zeros((size, 2), np.int32), np.zeros(size, np.float32), np.zeros((size, 3), np.float32),
+        )  # fmt: skip
+
+
+class Surroundings:
+    """The voxels of a stretch of flight.
+
+    Parameters
+    ----------
+    edge_m : float
+    """
+
+    def __init__(self, edge_m: float = EDGE_M) -> None:
+        self.edge_m = edge_m
+        self.voxels = Voxels.empty(_BEGIN)
+        self.used = 0
+        self.table = np.full(4 * _BEGIN, -1, np.int32)
+        self.begin_ns: int | None = None
+
+    @property
+    def full(self) -> bool:
+        """Whether the stretch of flight is to end here."""
+        return self.used > MOST
+
+    def add(self, xyz_m: Array, time_ns: Times, range_m: Single) -> None:
+        """Take points, shape (n, 3), with their times and ranges."""
+        if self.begin_ns is None:
+            self.begin_ns = int(time_ns[0])
+        self._make_room(len(xyz_m))
+        self.used = int(
+            _add(
+                xyz_m, (time_ns - self.begin_ns) // 1_000_000, range_m, self.edge_m, self.table, self.voxels, self.used
+            )
+        )
+
+    def find_planes(self) -> None:
+        """Find the plane of each voxel: all points are there."""
+        levels: list[Surroundings] = [self]
+        parents: list[Ints] = []
+        for _ in range(LEVELS):
+            below = levels[-1]
+            larger = Surroundings(2.0 * below.edge_m)
+            larger._make_room(below.used)
+            parent = np.empty(below.used, np.int32)
+            larger.used = int(_join(below.voxels, below.edge_m, larger.table, larger.voxels, parent))
+            levels.append(larger)
+            # of the small voxels, whichever level it is
+            parents.append(parent if not parents else parent[parents[-1]])
+        for level in levels:
+            _planes(level.voxels, level.used, level.edge_m)
+        found = np.zeros((self.used, 3), np.float32)
+        own = np.arange(self.used, dtype=np.int32)
+        for number in _ORDER:
+            level = levels[number]
+            _take(
+                self.voxels, self.edge_m, own if number == 0 else parents[number - 1], level.voxels, level.edge_m, found
+            )
+        self.voxels.normal[: self.used] = found
+        _borrow(self.table, self.voxels, self.used, self.edge_m)
+        for parent, level in zip(parents[2:], levels[3:], strict=True):
+            _take(self.voxels, self.edge_m, parent, level.voxels, level.edge_m, self.voxels.normal[: self.used])
+
+    def of(self, xyz_m: Array) -> Ints:
+        """Number of the voxel of each point, shape (n,); -1: of none."""
+        out = np.empty(len(xyz_m), np.int32)
+        _find(xyz_m, self.edge_m, self.table, self.voxels.key, out)
+        return out
+
+    def incidence_deg(self, xyz_m: Array, origins_m: Array, voxel: Ints) -> Single:
+        """Angle between beam and normal of each point, shape (n,); not-a-number without a plane."""
+        out = np.empty(len(xyz_m), np.float32)
+        _incidence(xyz_m, origins_m, voxel, self.voxels.normal, out)
+        return out
+
+    def _make_room(self, more: int) -> None:
+        """See that so many more voxels fit."""
+        size = len(self.voxels.key)
+        if self.used + more <= size:
+            return
+        while size < self.used + more:
+            size *= 2
+        grown = Voxels.empty(size)
+        for name, old in self.voxels._asdict().items():
+            getattr(grown, name)[: self.used] = old[: self.used]
+        self.voxels = grown
+        self.table = np.full(4 * size, -1, np.int32)
+        _fill_table(self.voxels.key, self.used, self.table)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def find(key: Any, table: Any, keys: Any) -> Any:
+    """Number of a voxel by its key; -1 where it is not there."""
+    mask = len(table) - 1
+    slot = spread(key) & mask
+    while table[slot] >= 0 and keys[table[slot]] != key:
+        slot = (slot + 1) & mask
+    return table[slot]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def beside(key: Any, i: int, j: int, k: int) -> Any:
+    """Key of the voxel so many voxels away."""
+    x, y, z = (key >> 42) + i, (key >> 21) + j, key + k
+    return ((x & _MASK) << 42) | ((y & _MASK) << 21) | (z & _MASK)
+
+
+@njit(cache=True, nogil=True)
+def _fill_table(keys: Any, used: int, table: Any) -> None:
+    mask = len(table) - 1
+    for v in range(used):
+        slot = spread(keys[v]) & mask
+        while table[slot] >= 0:
+            slot = (slot + 1) & mask
+        table[slot] = v
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _place_of(key: Any, table: Any, keys: Any, used: int) -> Any:
+    """Number of a voxel, which is the next one where it is new."""
+    mask = len(table) - 1
+    slot = spread(key) & mask
+    while table[slot] >= 0 and keys[table[slot]] != key:
+        slot = (slot + 1) & mask
+    if table[slot] < 0:
+        table[slot], keys[used] = used, key
+    return table[slot]
+
+
+@njit(cache=True, nogil=True)
+def _add(xyz: Any, time_ms: Any, range_m: Any, edge_m: float, table: Any, voxels: Voxels, used: int) -> int:
+    keys, many, sums, when, farthest = voxels.key, voxels.many, voxels.sums, voxels.when_ms, voxels.farthest_m
+    per_m = 1.0 / edge_m
+    for n in range(len(xyz)):
+        i, j, k = np.floor(xyz[n, 0] * per_m), np.floor(xyz[n, 1] * per_m), np.floor(xyz[n, 2] * per_m)
+        key = ((np.int64(i) & _MASK) << 42) | ((np.int64(j) & _MASK) << 21) | (np.int64(k) & _MASK)
+        v = _place_of(key, table, keys, used)
+        if v == used:
+            used += 1
+            when[v, 0] = time_ms[n]
+        many[v] += 1
+        when[v, 1] = time_ms[n]
+        farthest[v] = max(farthest[v], range_m[n])
+        if many[v] <= MOST_POINTS:
+            x = np.float32(xyz[n, 0] - (i + 0.5) * edge_m)
+            y = np.float32(xyz[n, 1] - (j + 0.5) * edge_m)
+            z = np.float32(xyz[n, 2] - (k + 0.5) * edge_m)
+            s = sums[v]
+            s[0] += 1.0
+            s[1] += x
+            s[2] += y
+            s[3] += z
+            s[4] += x * x
+            s[5] += x * y
+            s[6] += x * z
+            s[7] += y * y
+            s[8] += y * z
+            s[9] += z * z
+    return used
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_moved(total: Any, s: Any, x: float, y: float, z: float) -> None:
+    """Add sums whose middle lies (x, y, z) away to others, shape (10,)."""
+    n = s[0]
+    total[0] += n
+    total[1] += s[1] + n * x
+    total[2] += s[2] + n * y
+    total[3] += s[3] + n * z
+    total[4] += s[4] + 2.0 * x * s[1] + n * x * x
+    total[5] += s[5] + x * s[2] + y * s[1] + n * x * y
+    total[6] += s[6] + x * s[3] + z * s[1] + n * x * z
+    total[7] += s[7] + 2.0 * y * s[2] + n * y * y
+    total[8] += s[8] + y * s[3] + z * s[2] + n * y * z
+    total[9] += s[9] + 2.0 * z * s[3] + n * z * z
+
+
+@njit(cache=True, nogil=True, inline="always")
+def signed(part: Any) -> Any:
+    """A coordinate of 21 bits as a number."""
+    part = part & _MASK
+    return part - (_MASK + 1) if part > _MASK >> 1 else part
+
+
+@njit(cache=True, nogil=True, inline="always")
+def middle_of(key: Any, edge_m: float) -> Any:
+    """Middle of a voxel: three numbers."""
+    return (
+        (signed(key >> 42) + 0.5) * edge_m,
+        (signed(key >> 21) + 0.5) * edge_m,
+        (signed(key) + 0.5) * edge_m,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _join(voxels: Voxels, edge_m: float, table: Any, larger: Voxels, parent: Any) -> int:
+    """Fill voxels of twice the edge with the sums of small ones, and say which each is in; gives how many there are."""
+    found = 0
+    for v in range(len(parent)):
+        key = voxels.key[v]
+        i, j, k = signed(key >> 42) >> 1, signed(key >> 21) >> 1, signed(key) >> 1
+        above = ((i & _MASK) << 42) | ((j & _MASK) << 21) | (k & _MASK)
+        w = _place_of(above, table, larger.key, found)
+        if w == found:
+            found += 1
+        parent[v] = w
+        x, y, z = middle_of(key, edge_m)
+        a, b, c = middle_of(above, 2.0 * edge_m)
+        _add_moved(larger.sums[w], voxels.sums[v], x - a, y - b, z - c)
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _fit(s: Any, most_m: float, edge_m: float, normal: Any) -> Any:
+    """Whether sums are of something flat; `normal` takes its normal."""
+    n = s[0]
+    x, y, z = s[1] / n, s[2] / n, s[3] / n
+    low, middle = flattest(
+        s[4] / n - x * x,
+        s[5] / n - x * y,
+        s[6] / n - x * z,
+        s[7] / n - y * y,
+        s[8] / n - y * z,
+        s[9] / n - z * z,
+        normal,
+    )
+    return low < most_m * most_m and low < min(_SLOPE * _SLOPE * n, 0.1) * middle and middle > (0.12 * edge_m) ** 2
+
+
+@njit(cache=True, nogil=True)
+def _planes(voxels: Voxels, used: int, edge_m: float) -> None:
+    """Find the normal of the voxels that are flat."""
+    normal = np.empty(3)
+    for v in range(used):
+        s = voxels.sums[v]
+        good = s[0] >= _FEWEST and _fit(s, _FLAT_M + _FLAT_SHARE * edge_m, edge_m, normal)
+        for a in range(3):
+            voxels.normal[v, a] = normal[a] if good else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def has_plane(normal: Any, v: int) -> Any:
+    """Whether a normal was found."""
+    return normal[v, 0] != 0.0 or normal[v, 1] != 0.0 or normal[v, 2] != 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _off(voxels: Voxels, v: int, edge_m: float, others: Voxels, w: int, others_edge_m: float) -> Any:
+    """How far the mean of a voxel is off the plane of another, perhaps larger one [m]."""
+    x, y, z = middle_of(voxels.key[v], edge_m)
+    a, b, c = middle_of(others.key[w], others_edge_m)
+    s, t, n = voxels.sums[v], others.sums[w], others.normal[w]
+    away = n[0] * (x - a + s[1] / s[0] - t[1] / t[0])
+    away += n[1] * (y - b + s[2] / s[0] - t[2] / t[0])
+    away += n[2] * (z - c + s[3] / s[0] - t[3] / t[0])
+    return abs(away)
+
+
+@njit(cache=True, nogil=True)
+def _take(voxels: Voxels, edge_m: float, parent: Any, larger: Voxels, larger_edge_m: float, normal: Any) -> None:
+    """Give voxels without a plane that of the voxel they are in, if it passes through their points; fills `normal`, shape (used, 3)."""
+    for v in range(len(parent)):
+        w = parent[v]
+        if has_plane(normal, v) or not has_plane(larger.normal, w):
+            continue
+        if _off(voxels, v, edge_m, larger, w, larger_edge_m) < _NEAR_M:
+            for a in range(3):
+                normal[v, a] = larger.normal[w, a]
+
+
+@njit(cache=True, nogil=True)
+def _borrow(table: Any, voxels: Voxels, used: int, edge_m: float) -> None:
+    """Give voxels without a plane that of the neighbour which passes nearest to their mean."""
+    keys, normal = voxels.key, voxels.normal
+    chosen = np.full(used, -1, np.int32)
+    for v in range(used):
+        if has_plane(normal, v):
+            continue
+        least = _NEAR_M
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    w = find(beside(keys[v], i, j, k), table, keys)
+                    if w >= 0 and has_plane(normal, w):
+                        off = _off(voxels, v, edge_m, voxels, w, edge_m)
+                        if off < least:
+                            least, chosen[v] = off, w
+    for v in range(used):
+        if chosen[v] >= 0:
+            normal[v] = normal[chosen[v]]
+
+
+@njit(cache=True, nogil=True)
+def _find(xyz: Any, edge_m: float, table: Any, keys: Any, out: Any) -> None:
+    per_m = 1.0 / edge_m
+    for n in range(len(xyz)):
+        out[n] = find(voxel_key(xyz[n, 0], xyz[n, 1], xyz[n, 2], per_m), table, keys)
+
+
+@njit(cache=True, nogil=True)
+def _incidence(xyz: Any, origin: Any, voxel: Any, normal: Any, out: Any) -> None:
+    for n in range(len(xyz)):
+        out[n] = np.nan
+        v = voxel[n]
+        if v < 0 or not has_plane(normal, v):
+            continue
+        square, along = 0.0, 0.0
+        for a in range(3):
+            way = xyz[n, a] - origin[n, a]
+            square += way * way
+            along += way * normal[v, a]
+        out[n] = np.rad2deg(np.arccos(min(abs(along) / np.sqrt(max(square, 1e-12)), 1.0)))
