@@ -78,13 +78,13 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
         self._half_bytes = half_bytes + -half_bytes % mmap.ALLOCATIONGRANULARITY
         chunk_points = int.from_bytes(vlr[_CHUNK_SIZE_AT : _CHUNK_SIZE_AT + 4], "little")
         parallel = chunk_points == _VARIABLE or chunk_points * self._point_bytes <= _CHUNK_BYTES
-        shared = _shared(2 * self._half_bytes)
+        shared = shared_memory(2 * self._half_bytes)
         try:
             self._memory = mmap.mmap(shared, 2 * self._half_bytes)
             limit = _MEMORY_BYTES + 2 * self._half_bytes
             offset = int(header.offset_to_point_data)
             task = Task(str(path), offset, vlr.hex(), self._point_bytes, shared, self._half_bytes, limit, parallel)
-            self._child = _start(task)
+            self._child = start(task)
         finally:
             os.close(shared)
 
@@ -138,7 +138,7 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
         if answer == "ok\n":
             return
         if not answer:
-            answer = _end(self._child.wait())
+            answer = ended(self._child.wait())
         raise LaspyException(answer.strip())
 
 
@@ -147,7 +147,7 @@ def _pipe(pipe: IO[str] | None) -> IO[str]:
     return pipe
 
 
-def _end(code: int) -> str:
+def ended(code: int) -> str:
     """Why a process ended that said nothing."""
     if code == -signal.SIGXCPU:
         return "unpacking its points does not come to an end"
@@ -155,7 +155,7 @@ def _end(code: int) -> str:
     return f"unpacking its points failed with {name}"
 
 
-def _shared(size: int) -> int:
+def shared_memory(size: int) -> int:
     """A file descriptor of memory that processes can share."""
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create("points")
@@ -166,7 +166,7 @@ def _shared(size: int) -> int:
     return descriptor
 
 
-def _start(task: Task) -> "subprocess.Popen[str]":
+def start(task: Task) -> "subprocess.Popen[str]":
     """Start the other process, with nothing of this one's environment but what lazrs' threads need."""
     packages = str(Path(lazrs.__file__).parents[1])
     return subprocess.Popen(

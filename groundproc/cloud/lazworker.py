@@ -2,8 +2,8 @@
 
 Run as a script by `groundproc.cloud.laz`, with the folder of the packages and a JSON object of `Task`'s fields as arguments, and nothing
 imported but lazrs: it starts in 30 ms. It shares a memory of two halves with the process that started it. Each line of the standard input,
-`HALF COUNT`, asks for the next so many points in one of the halves; `ok` on the standard output says that they are there, and any other
-line is an error.
+`HALF COUNT`, asks for the next so many points in one of the halves; `HALF COUNT PLACE SIZE` for all points of the one chunk that has so
+many bytes from there on in the file. `ok` on the standard output says that they are there, and any other line is an error.
 """
 
 import json
@@ -65,17 +65,22 @@ def _unpack(task: Task) -> None:
     import lazrs
 
     kind: Any = lazrs.ParLasZipDecompressor if task.parallel else lazrs.LasZipDecompressor
+    packing = bytes.fromhex(task.vlr)
     with open(task.path, "rb") as file, mmap.mmap(task.shared, 2 * task.half_bytes) as shared:  # noqa: PTH123 - pathlib costs 10 ms
         file.seek(task.offset)
         unpacker: Any = None
         for line in sys.stdin:
-            half, count = map(int, line.split())
+            half, count, *chunk = map(int, line.split())
             _allow(count)
-            if unpacker is None:
-                unpacker = kind(file, bytes.fromhex(task.vlr))
             begin = half * task.half_bytes
             with memoryview(shared) as whole, whole[begin : begin + count * task.point_bytes] as place:
-                unpacker.decompress_many(place)
+                if chunk:
+                    file.seek(chunk[0])
+                    packed = file.read(chunk[1])
+                    lazrs.decompress_points_with_chunk_table(packed, packing, place, [(count, len(packed))])
+                else:
+                    unpacker = unpacker or kind(file, packing)
+                    unpacker.decompress_many(place)
             _answer("ok")
 
 

@@ -128,21 +128,33 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
     """
     if clock is not None and not cloud.timed:
         raise CaptureError(f"{cloud.path}: its points have no gps_time, expected the time of each point")
-    wanted = in_order(cloud.columns if columns is None else set(columns) & set(cloud.columns))
     with opened(cloud.path) as reader:
         seen = 0
         for record in _records(cloud.path, reader):
             seen += len(record)
-            xyz = _places(cloud.path, record)
             time_ns = np.zeros(len(record), np.int64)
             if clock is not None:
                 time_s = np.asarray(record.gps_time, np.float64)
                 clock = clock.begun(time_s) if cloud.week_time else clock
                 time_ns = clock.utc_ns(cloud.path, cloud.week_time, time_s)
-            values = {entry.name: _column(entry, record) for entry in wanted}
-            yield Chunk(Points(time_ns, xyz, values), record)
+            yield Chunk(points_of(cloud, record, time_ns, columns), record)
         if seen != cloud.points:
             raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
+
+
+def points_of(
+    cloud: Cloud, record: Any, time_ns: npt.NDArray[np.int64], columns: Collection[str] | None = None
+) -> Points:
+    """Records of a file, shape (n,), as points in the units of the table; `columns` as for `chunks`.
+
+    Raises
+    ------
+    CaptureError
+        A place is beyond any map.
+    """
+    wanted = in_order(cloud.columns if columns is None else set(columns) & set(cloud.columns))
+    values = {entry.name: _column(entry, record) for entry in wanted}
+    return Points(time_ns, _places(cloud.path, record), values)
 
 
 def _crs(path: Path, header: Any) -> pyproj.CRS | None:

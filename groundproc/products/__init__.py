@@ -49,6 +49,9 @@ REGISTRY: Final[dict[str, Entry]] = {
     "trajectory.gpx": Entry(
         "groundproc.products.trajectory_maps", "write", "the flown path for phones and globes: trajectory.gpx and .kml", by_default=False
     ),
+    "report.html": Entry(
+        "groundproc.products.report", "write", "the flight on one page for the browser: verdict, cloud, maps, quality, losses, hashes"
+    ),
     "adjustment.png": Entry(
         "groundproc.products.adjustment_plot", "draw", "method adjusted: what it left over, and how well it knows what it estimated"
     ),

@@ -1,7 +1,7 @@
 """What a product is, what it is told, and how chosen ones are made: written aside, with their name in an error."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -36,6 +36,8 @@ class Context:
         From the trajectory's local frame to coordinates of the points.
     quality : dict
         What quality.json holds: inputs, versions, settings, figures. Empty while points are placed.
+    digests : mapping of str to str
+        SHA-256 of the logs and of what the steps before have made, by name. Empty while points are placed.
     inputs : tuple of str
         Names of the logs.
     software : str
@@ -50,6 +52,7 @@ class Context:
     estimate: Estimate
     projection: Projection
     quality: dict[str, Any] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
     inputs: tuple[str, ...] = ()
     software: str = f"swath {__version__}"
     kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)

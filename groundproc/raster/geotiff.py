@@ -139,6 +139,28 @@ class Raster:
         return np.asarray(read.filled(np.nan), np.float32)
 
 
+def coarse(raster: Raster, most: int) -> tuple[npt.NDArray[np.float32], float]:
+    """The whole raster with at most so many cells along a side, means of the file's own, and the size of a cell [m].
+
+    Of a large file the overviews are read.
+
+    Raises
+    ------
+    CaptureError
+        The file is damaged.
+    """
+    grid = raster.grid
+    step = max(max(grid.columns, grid.rows) / most, 1.0)
+    shape = (max(round(grid.rows / step), 1), max(round(grid.columns / step), 1))
+    try:
+        read = raster.file.read(
+            1, out_shape=shape, masked=True, out_dtype="float32", resampling=rasterio.enums.Resampling.average
+        )
+    except (RasterioError, OSError) as error:
+        raise CaptureError(f"{raster.path}: is damaged ({_sentence(error)})") from None
+    return np.asarray(read.filled(np.nan), np.float32), grid.cell_m * step
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Raster]:
     """A raster file.

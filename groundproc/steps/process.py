@@ -5,7 +5,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -122,13 +122,13 @@ def _bring_up_to_date(step: Step, run: Run, ledger: Ledger, force: bool) -> None
     parts = step.parts(run.request)
     due = [part for part in parts if force or reasons(step, part, run.request, ledger)]
     if due:
-        _execute(step, due, run, ledger, force)
+        execute(step, due, run, ledger, force)
     for unit in [unit for unit in ledger.entries if unit.partition(BETWEEN)[0] == step.name]:
         if unit not in step.units(run.request):
             ledger.drop(unit)
 
 
-def _execute(step: Step, parts: Sequence[str], run: Run, ledger: Ledger, force: bool) -> None:
+def execute(step: Step, parts: Sequence[str], run: Run, ledger: Ledger, force: bool) -> None:
     """Make parts of a step and enter them."""
     staged = staging(ledger.folder, step.name)
     folders = {part: staged / folder_of(part) for part in parts}
@@ -278,7 +278,7 @@ def admitted(request: Request, folder: Path, force: bool) -> Ledger:
     sweep(folder)
     if not force:
         _refuse_other_inputs(request, ledger)
-        _refuse_changed(ledger)
+        refuse_changed(ledger, ledger.entries)
     ledger.logs = [str(log.resolve()) for log in request.logs]
     ledger.poses = str(request.poses.resolve()) if request.poses else None
     ledger.survey = config.to_mapping(absolute(request.survey))
@@ -317,9 +317,11 @@ def _refuse_other_inputs(request: Request, ledger: Ledger) -> None:
         )
 
 
-def _refuse_changed(ledger: Ledger) -> None:
-    """Refuse to write over products that somebody has changed."""
-    for unit in ledger.entries:
+def refuse_changed(ledger: Ledger, units: Iterable[str]) -> None:
+    """Refuse to write over products of some steps that somebody has changed."""
+    for unit in units:
+        if unit not in ledger.entries:
+            continue
         for name, what in ledger.changed(unit).items():
             if (ledger.folder / name).exists():
                 raise UsageError(f"{ledger.folder / name}: {what} it was made here; --force replaces it")

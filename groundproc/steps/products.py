@@ -3,14 +3,16 @@
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 from groundproc.products import chosen, plain
 from groundproc.products.product import Context, draw
+from groundproc.steps.ledger import INSIDE, open_ledger
 from groundproc.steps.place import projection_of
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import Folders, Step
+from groundproc.steps.step import BETWEEN, Folders, Step
 
 
 def settings(request: Request) -> Mapping[str, Any]:
@@ -29,10 +31,23 @@ def work(run: Run, folders: Folders) -> None:
     made = run.estimate
     quality = json.loads((run.folder / "quality.json").read_text(encoding="utf-8"))
     projection = projection_of(made.trajectory.frame, run.survey)
-    context = Context(run.folder, run.folder, run.survey, made, projection, quality, run.names)
+    digests = digests_of(run.folder)
+    context = Context(run.folder, run.folder, run.survey, made, projection, quality, digests, run.names)
     for each in chosen(run.survey.products):
         if each.name in folders:
             draw([each], replace(context, folder=folders[each.name]))
+
+
+def digests_of(folder: Path) -> dict[str, str]:
+    """SHA-256 of the logs and of what the other steps left, by name: the same whether this step was done before or not."""
+    ledger = open_ledger(folder)
+    if ledger is None:
+        return {}
+    found = {Path(log).name: ledger.files[log].digest for log in ledger.logs if log in ledger.files}
+    for unit, entry in ledger.entries.items():
+        if unit.partition(BETWEEN)[0] != STEP.name:
+            found |= {name: mark.digest for name, mark in entry.outputs.items() if not name.startswith(INSIDE)}
+    return found
 
 
 STEP: Final = Step(

@@ -56,7 +56,7 @@ def test_without_a_wish_all_products_are_made_and_agree(still_flight: Any, tmp_p
     assert main(["process", str(still_flight.log), "--method", "ins", "-o", str(tmp_path / "out")]) in COMPLETE
     made = Processed(tmp_path / "out")
     assert {path.name for path in made.folder.iterdir()} == PRODUCTS | {LEDGER} | {
-        "cloud.copc.laz", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif", "trajectory.gpkg",
+        "cloud.copc.laz", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif", "trajectory.gpkg", "report.html",
     }  # fmt: skip
     cloud, octree = made.cloud, laspy.read(made.folder / "cloud.copc.laz")
     order = np.lexsort((cloud["laser"], cloud.gps_time)), np.lexsort((octree["laser"], octree.gps_time))

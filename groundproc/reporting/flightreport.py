@@ -1,0 +1,134 @@
+"""report.html: what a flight brought, on one page that opens from the disk and asks nothing of any network."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.raster import geotiff
+from groundproc.reporting import cloudpart, maps, words
+from groundproc.reporting.charts import charts
+from groundproc.reporting.cloudpart import CloudPart
+from groundproc.reporting.markup import Html, section, tag
+from groundproc.reporting.plots import draw
+from groundproc.trajectory.estimate import Estimate
+from groundproc.viewer.page import VIEWER, page, script_of
+
+Array = npt.NDArray[np.float64]
+
+STYLES: Final = ("base.css", "viewer.css", "report.css")
+_DENSITY: Final = "density.tif"
+_CELLS: Final = 2000
+"""Along a side of the density that area and median are taken from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """What a report is of.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the finished products.
+    quality : mapping
+        quality.json.
+    estimate : Estimate
+    paths : sequence of ndarray, shape (k, 3)
+        Covered pieces of the trajectory in the CRS of the points.
+    digests : mapping of str to str
+        SHA-256 of inputs and products by name.
+    """
+
+    folder: Path
+    quality: Mapping[str, Any]
+    estimate: Estimate
+    paths: Sequence[Array]
+    digests: Mapping[str, str]
+
+
+def compose(subject: Subject, most_points: int, most_bytes: int) -> str:
+    """The page, of at most so many bytes.
+
+    Raises
+    ------
+    CaptureError
+        A product that it shows is damaged.
+    """
+    part = cloudpart.read(subject.folder, most_points)
+    rest = len(_page(subject, part, "").encode())
+    if part is None:
+        return _page(subject, None, "")
+    text, part = cloudpart.fitted(part, most_bytes - rest - 64)
+    return _page(subject, part, text)
+
+
+def _page(subject: Subject, part: CloudPart | None, text: str) -> str:
+    quality = subject.quality
+    names = ", ".join(log["file"] for log in quality["inputs"])
+    density, area_m2 = _covered(subject, part)
+    parts = [
+        tag("header", tag("h1", f"Flight of {_day(quality)}"), tag("p", names)),
+        words.verdict(quality),
+        words.facts(quality, density, area_m2),
+        words.story(quality),
+        _cloud(subject, part, text),
+        _maps(subject, part),
+        section(
+            "quality",
+            "Quality over time",
+            tag("div", [draw(plot) for plot in charts(subject.estimate)], class_="plots"),
+        ),
+        words.clocks(quality),
+        words.control(quality),
+        words.losses(quality),
+        words.settings(quality["config"]),
+        words.provenance(quality, subject.digests),
+        tag("footer", "All figures are in quality.json beside this page."),
+    ]
+    return page(f"Flight of {_day(quality)}", STYLES, tag("main", parts), script_of((*VIEWER, "report.js")))
+
+
+def _day(quality: Mapping[str, Any]) -> str:
+    """Date and time of day, as a title."""
+    start = str(quality["trajectory"]["start"])
+    return f"{start[:10]}, {start[11:16]} UTC"
+
+
+def _cloud(subject: Subject, part: CloudPart | None, text: str) -> Html:
+    if part is None:
+        missing = " or ".join(cloudpart.CLOUDS)
+        return section(
+            "cloud",
+            "Cloud",
+            tag("p", f"No cloud is shown, because none of the products holds points: choose {missing}."),
+        )
+    return section("cloud", "Cloud", cloudpart.element(part, text, subject.paths))
+
+
+def _maps(subject: Subject, part: CloudPart | None) -> Html:
+    layers, shade = maps.layers_of(subject.folder, list(subject.digests))
+    if not layers and part is not None:
+        layers = [maps.of_points(part.points.xyz_m)]
+    if not layers:
+        return Html("")
+    buttons = [tag("button", each.title, type="button", data_layer=each.name, aria_pressed="false") for each in layers]
+    chooser = tag("div", buttons if len(buttons) > 1 else [], class_="choose")
+    about = "Red: the path of the flight. North is up."
+    drawn = maps.figures(layers, shade, subject.paths)
+    return section("map", "Map", tag("div", chooser, drawn, class_="layers"), tag("p", about, class_="aside"))
+
+
+def _covered(subject: Subject, part: CloudPart | None) -> tuple[float | None, float | None]:
+    """Median density [points/m2] and area [m2] of what has points."""
+    if _DENSITY in subject.digests and (subject.folder / _DENSITY).is_file():
+        with geotiff.opened(subject.folder / _DENSITY) as raster:
+            values, cell_m = geotiff.coarse(raster, _CELLS)
+        seen = values[values > 0.0]
+        return (float(np.median(seen)), float(len(seen) * cell_m**2)) if len(seen) else (None, None)
+    if part is None:
+        return None, None
+    cells = np.unique(np.floor(part.points.xyz_m[:, :2]).astype(np.int64), axis=0, return_counts=True)[1]
+    return float(np.median(cells)) * part.total / len(part.points), float(len(cells))

@@ -1,0 +1,133 @@
+"""A cloud of any size thinned to so many points, evenly: of an octree only what is needed is read."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.cloud import reader
+from groundproc.cloud.nodes import NodeReader, is_copc, octree_of
+from groundproc.cloud.reader import Cloud
+from groundproc.numerics.voxelhash import assign
+
+Array = npt.NDArray[np.float64]
+
+_READ: Final = 3
+"""Times as many points are looked at as are kept."""
+_CLOSE: Final = 0.97
+"""Share of the wanted points that is enough."""
+_TRIALS: Final = 12
+_GOLDEN: Final = 0.6180339887498949
+
+
+@dataclass(frozen=True, slots=True)
+class Thinned:
+    """Some points of a cloud.
+
+    Attributes
+    ----------
+    xyz_m : ndarray, shape (n, 3)
+        In the cloud's CRS.
+    columns : dict of str to ndarray, shape (n,)
+        As in `Points`.
+    time_s : ndarray or None, shape (n,)
+        As stored.
+    spacing_m : float
+        Side of the voxels of which each gave one point; 0: all points are here.
+    """
+
+    xyz_m: Array
+    columns: dict[str, npt.NDArray[Any]]
+    time_s: Array | None
+    spacing_m: float
+
+    def __len__(self) -> int:
+        return len(self.xyz_m)
+
+    def part(self, chosen: npt.NDArray[Any], spacing_m: float) -> "Thinned":
+        """Those of a mask, or of places in the arrays."""
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return Thinned(self.xyz_m[chosen], columns, None if self.time_s is None else self.time_s[chosen], spacing_m)
+
+
+def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None) -> Thinned:
+    """At most so many points, spread as evenly as voxels of one size can; the same ones every time.
+
+    Raises
+    ------
+    CaptureError
+        The cloud is damaged.
+    """
+    parts = list((_of_octree if is_copc(cloud.path) else _of_file)(cloud, _READ * most, columns))
+    names = parts[0].columns
+    whole = Thinned(
+        np.concatenate([part.xyz_m for part in parts]),
+        {name: np.concatenate([part.columns[name] for part in parts]) for name in names},
+        np.concatenate([part.time_s for part in parts if part.time_s is not None]) if cloud.timed else None,
+        0.0,
+    )
+    return thinner(whole, most)
+
+
+def thinner(points: Thinned, most: int) -> Thinned:
+    """At most so many of some points."""
+    if len(points) <= most:
+        return points
+    low, high = 0.0, float(np.ptp(points.xyz_m, axis=0).max()) + 0.001
+    local = points.xyz_m - points.xyz_m.min(axis=0)
+    voxel_m = max(high / np.sqrt(most), points.spacing_m)
+    best: tuple[npt.NDArray[Any], float] | None = None
+    for _ in range(_TRIALS):
+        voxel, found = assign(local, voxel_m)
+        if found > most:
+            low = voxel_m
+        else:
+            high = voxel_m
+            # voxels are numbered as they are met: the first point of each
+            best = np.flatnonzero(np.diff(np.maximum.accumulate(voxel), prepend=-1) > 0), voxel_m
+            if found >= _CLOSE * most:
+                break
+        # cells on a surface: their number goes with the square of their size
+        guess = voxel_m * np.sqrt(found / (0.985 * most))
+        voxel_m = guess if low < guess < high else (low + high) / 2.0
+    if best is None:
+        best = np.flatnonzero(_share(len(points), most / len(points))), high
+    return points.part(best[0][:most], best[1])
+
+
+def _share(count: int, share: float, begin: int = 0) -> npt.NDArray[np.bool_]:
+    """A mask of about such a share, spread without any period that a scanner could have (the golden section's multiples)."""
+    return np.asarray((np.arange(begin, begin + count) * _GOLDEN) % 1.0 < share)
+
+
+def _of_octree(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterator[Thinned]:
+    """Levels from the root down, until there are enough points."""
+    octree = octree_of(cloud.path)
+    levels: dict[int, list[Any]] = {}
+    for key in sorted(octree.nodes):
+        levels.setdefault(key[0], []).append(octree.nodes[key])
+    left = most
+    with NodeReader(cloud, octree) as nodes:
+        for level in sorted(levels):
+            total = sum(node.points for node in levels[level])
+            share = min(left / total, 1.0)
+            for node in levels[level]:
+                points, time_s = nodes.read(node, columns)
+                some = Thinned(points.xyz_m, dict(points.columns), time_s if cloud.timed else None, 0.0)
+                yield some if share == 1.0 else some.part(_share(len(some), share), 0.0)
+            left -= total
+            if left <= 0:
+                return
+
+
+def _of_file(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterator[Thinned]:
+    """All points in their order, or an even share of them."""
+    share, seen = min(most / cloud.points, 1.0), 0
+    for chunk in reader.chunks(cloud, columns=columns):
+        chosen = _share(len(chunk.points), share, seen) if share < 1.0 else np.ones(len(chunk.points), bool)
+        seen += len(chunk.points)
+        time_s = np.asarray(chunk.record.gps_time, np.float64)[chosen] if cloud.timed else None
+        picked = {name: values[chosen] for name, values in chunk.points.columns.items()}
+        yield Thinned(chunk.points.xyz_m[chosen], picked, time_s, 0.0)
