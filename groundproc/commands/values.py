@@ -28,3 +28,10 @@ def milliseconds(text: str, word: str = "--pose-grid-ms") -> float:
     if not 1.0 <= value <= 1000.0:
         raise UsageError(f"{word} {text!r}: expected a duration of 1ms to 1000ms")
     return value
+
+
+def count(text: str, word: str) -> int:
+    """A whole number of 1 and more."""
+    if not (text.isdecimal() and 1 <= int(text) <= 10_000):
+        raise UsageError(f"{word} {text!r}: expected a whole number of 1 to 10000")
+    return int(text)
