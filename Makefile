@@ -5,7 +5,8 @@
 #   make check       format, lint, types, import contracts, then the tests
 #   make soak        the long tests: hour-long logs, many seeds
 #   make bench-NAME  one benchmark of benchmarks/; its last line is one JSON object
-#   make bench       all of them, into docs/benchmarks.md, but the longest: `benchmarks/all.py --only study windows`
+#   make bench       all of them, into docs/benchmarks.md, but the longest: `benchmarks/all.py --only kit study windows`
+#   make deb         dist/swathd_VERSION_{amd64,arm64}.deb, for the payload computer
 #   make clean       everything made, the environment included
 
 SHELL := /bin/bash
@@ -18,7 +19,7 @@ PYTEST := $(BIN)/pytest
 # A file of tests stays on one worker, so that what its fixtures made is made once.
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: setup demo test check soak bench clean
+.PHONY: setup demo test check soak bench deb clean
 
 setup: $(VENV)/.installed
 
@@ -76,6 +77,9 @@ soak: setup
 
 bench-%: setup
 	@$(BIN)/python benchmarks/$*.py
+
+deb: setup
+	$(BIN)/python package/deb.py
 
 bench: setup
 	@$(BIN)/python benchmarks/all.py

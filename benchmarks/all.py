@@ -19,8 +19,8 @@ PAGE: Final = ROOT / "docs" / "benchmarks.md"
 FIGURES: Final = ROOT / "docs" / "benchmarks.json"
 NO_BENCHMARKS: Final = ("all", "drawing", "long_log", "machine", "mutations")
 """This one, what others use, and what measures the tests."""
-ON_DEMAND: Final = ("study", "windows")
-"""What takes an hour and more: measured where `--only` names it."""
+ON_DEMAND: Final = ("kit", "study", "windows")
+"""What takes an hour and more, or root: measured where `--only` names it."""
 LIBRARIES: Final = (
     "swath", "numpy", "numba", "scipy", "mcap", "laspy", "lazrs", "pyproj", "pymavlink", "velodyne-decoder", "kiss-icp", "small_gicp",
 )  # fmt: skip

@@ -30,6 +30,8 @@ _FILES: Final = {
 _SSHD: Final = ("sshd.conf", Path("etc/ssh/sshd_config.d/60-swathd.conf"))
 _NETWORK: Final = ("lidar.network", Path("etc/systemd/network/10-swath-lidar.network"))
 _LINK: Final = Path("usr/local/bin/swathd")
+PACKAGED: Final = Path("/usr/lib/swathd")
+"""Where Debian's package has its modules; what it puts in place is dpkg's to change."""
 _HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """What the service does not see of the file system."""
 
@@ -85,6 +87,35 @@ def find_program(given: Path | None) -> Path:
                 f"{part}: the service sees nothing in {', '.join(_HIDDEN)}; make the environment in /opt/swath"
             )
     return program
+
+
+def packaged() -> bool:
+    """Whether this is the program of Debian's package."""
+    return Path(onboard.__file__).is_relative_to(PACKAGED)
+
+
+def set_up_network(root: Path, interface: str | None) -> list[str]:
+    """All that is left to do where the package has put everything else in place: the lidar's port.
+
+    Raises
+    ------
+    UsageError
+        No port is named.
+    SwathError
+        A file cannot be written, or a command of the system fails.
+    """
+    if interface is None:
+        raise UsageError(
+            "install: swathd is Debian's package here, and in place; --lidar-interface NAME sets up the network port of the lidar"
+        )
+    name, path = _NETWORK
+    _write(root / path, template(name).replace(f"Name={INTERFACE}", f"Name={interface}"))
+    if _runs(root):
+        _call("systemctl", "enable", "--now", "systemd-networkd.service")
+        _try("networkctl", "reload")
+    else:
+        _try("systemctl", f"--root={root}", "enable", "systemd-networkd.service")
+    return [f"wrote /{path}", "enabled systemd-networkd.service"]
 
 
 def template(name: str) -> str:
@@ -205,7 +236,11 @@ def uninstall(root: Path) -> list[str]:
     ------
     SwathError
         A file cannot be removed.
+    UsageError
+        dpkg put them there.
     """
+    if packaged():
+        raise UsageError("uninstall: swathd is Debian's package here: apt remove swathd takes it away")
     if _runs(root):
         _try("systemctl", "disable", "--now", "swathd.service")
     else:

@@ -18,6 +18,9 @@ def run(options: argparse.Namespace) -> int:
     """Install; says what was done."""
     from onboard import install
 
+    if install.packaged():
+        print("\n".join(install.set_up_network(options.root.resolve(), options.lidar_interface)))
+        return 0
     place = install.Place(options.root.resolve(), install.find_program(options.program))
     print("\n".join(install.install(place, options.lidar_interface, start=not options.no_start)))
     return 0
