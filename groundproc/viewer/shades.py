@@ -16,7 +16,8 @@ NO_VALUE: Final = 255
 """The byte of a value that is not a number, or is none of the kinds that are named."""
 _MOST_KINDS: Final = 40
 """Whole numbers with more values than this are shown as a scale."""
-_MEASURES: Final = ("intensity", "red", "green", "blue", "nir")
+_COLOURS: Final = ("red", "green", "blue")
+_MEASURES: Final = ("intensity", *_COLOURS, "nir")
 """Whole numbers that are a scale however few values they take."""
 _STEPS: Final = 254
 _SHOWN: Final = (1.0, 99.0)
@@ -113,7 +114,9 @@ def _scale(name: str, label: str, unit: str, values: Values) -> Shade:
     known = known[np.isfinite(known)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     step = (high - low) / _STEPS or 1.0
-    if values.dtype.kind in "ui" and high - low <= _STEPS:
+    if name in _COLOURS:  # together they are one: from black on, in steps of the one byte or the two that they are in
+        low, step = 0.0, 257.0 if high > 255.0 else 1.0
+    elif values.dtype.kind in "ui" and high - low <= _STEPS:
         step = 1.0  # every value as it is
     shown = np.percentile(known, _SHOWN) if len(known) else np.array([low, high])
     return Shade(name, label, unit, low=low, step=step, shown=(float(shown[0]), float(shown[1])))

@@ -17,7 +17,7 @@ Viewer.prototype.panel = function () {
   this.extra = make("div", {className: "extra"});
   this.sheet = make("details", {className: "panel", open: innerWidth > 640}, make("summary", {textContent: "Colour and tools"}),
     make("label", {className: "row"}, make("span", {textContent: "colour by"}), this.chooser), this.legend,
-    make("label", {className: "row"}, make("span", {textContent: "points"}), this.size),
+    make("label", {className: "row"}, make("span", {textContent: "point size"}), this.size),
     make("div", {className: "row"}, make("label", {}, dome, " depth shading"), ...(this.scene.paths.length ? [make("label", {}, path, " flight path")] : [])),
     this.section, this.extra, this.results);
   this.bar = make("div", {className: "tools"},
@@ -117,13 +117,12 @@ function drawOverlay(viewer, view) {
   // scale: true at the centre of the picture
   const long = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find(v => v / view.perPixel > 70) || 10000;
   const wide = long / view.perPixel, x = view.width - 16, y = view.height - 16;
-  line([[x - wide, y - 5], [x - wide, y], [x, y], [x, y - 5]], viewer.ink, 1.5);
-  paint.fillStyle = viewer.ink; paint.font = "12px system-ui, sans-serif"; paint.textAlign = "right"; paint.fillText(long + " m", x, y - 9);
-  if (viewer.slab) {
-    const [a, b] = [viewer.slab.a, viewer.slab.b].map(p => onScreen(view, p));
-    paint.textAlign = "left"; paint.fillText("heights to the same scale", 16, y - 9);
-    return a && b;
-  }
+  const ruler = [[x - wide, y - 5], [x - wide, y], [x, y], [x, y - 5]], words = (text, up) => {
+    paint.font = "12px system-ui, sans-serif"; paint.textAlign = "right"; paint.lineWidth = 3; paint.strokeStyle = viewer.paper;
+    paint.strokeText(text, x, y - up); paint.fillStyle = viewer.ink; paint.fillText(text, x, y - up);
+  };
+  line(ruler, viewer.paper, 4); line(ruler, viewer.ink, 1.5); words(long + " m", 9);
+  if (viewer.slab) return words("heights to the same scale", 26);
   // north arrow, as it lies on the ground
   const up = onScreen(view, camera.centre), north = onScreen(view, [camera.centre[0], camera.centre[1] + 30 * view.perPixel, camera.centre[2]]);
   if (up && north) {

@@ -128,7 +128,7 @@ class Viewer {
     const {camera} = this;
     camera.ortho = true; camera.elevation = 0; camera.azimuth = Math.atan2(-slab.n[1], -slab.n[0]);
     camera.centre = [0, 1, 2].map(i => (a[i] + b[i]) / 2);
-    camera.distance = slab.length * 0.56 / Math.tan(FOV / 2) * Math.min(1, this.canvas.clientHeight / this.canvas.clientWidth);
+    camera.distance = slab.length * 0.68 / Math.tan(FOV / 2) * Math.min(1, this.canvas.clientHeight / this.canvas.clientWidth);
     this.thickness.value = String(Math.log10(2 * half)); this.section.hidden = false;
     this.turned(); drawResults(this);
   }

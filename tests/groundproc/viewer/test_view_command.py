@@ -1,0 +1,174 @@
+"""`swath view` in a real browser: levels of detail, and classes changed by the mouse."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from browser import PROGRAM, Page, browser
+
+from groundproc.cli import main
+
+Clouds = Callable[[int], tuple[Path, Path]]
+needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
+POINTS = 150_000
+
+
+@contextlib.contextmanager
+def viewed(*words: object) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
+    """The command, and the address that it names."""
+    code = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "view", *map(str, words), "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("look at http://127.0.0.1:"), (line, process.stderr and process.stderr.read())
+        yield line.split()[2], process
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(30)
+        for pipe in (process.stdout, process.stderr):
+            if pipe is not None:
+                pipe.close()
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("browser")) as page:
+        page.looks(1000, 700)
+        yield page
+
+
+def settled(page: Page) -> None:
+    page.until(
+        "window.swathViewer && swathViewer.ready && swathViewer.octree.settled && !swathViewer.dirty && !swathViewer.coarse"
+    )
+
+
+@needs_browser
+def test_what_is_near_is_shown_in_full_and_what_is_far_is_not(tab: Page, clouds: Clouds) -> None:
+    with viewed(clouds(POINTS)[1]) as (address, _):
+        tab.open(address)
+        settled(tab)
+        assert tab.said == []
+        assert tab.asked[0] == address
+        assert all(each.startswith((address, "data:")) for each in tab.asked)
+        # there is room for all of them, but for nodes that are small in the picture
+        assert 0.8 * POINTS < tab.run("swathViewer.drawn") <= POINTS
+        tab.run("swathViewer.octree.budget = 110000; swathViewer.octree.choose()")
+        settled(tab)
+        assert 0 < tab.run("swathViewer.drawn") < 0.95 * POINTS
+        # near the corner where points are densest: all levels there, and little of the rest
+        tab.run(
+            "{ const v = swathViewer, low = v.scene.low; v.camera.centre = [low[0] + 12, low[1] + 9, low[2]];"
+            " v.camera.distance = 4; v.turned() }"
+        )
+        settled(tab)
+        levels = "Math.max(...[...swathViewer.octree.nodes.values()].filter(n => n.chunk && n.chunk.shown).map(n => n.level))"
+        assert tab.run(levels) == tab.run("Math.max(...swathViewer.scene.nodes.map(n => n[0]))")
+        tab.run("swathViewer.octree.budget = 2e6; swathViewer.octree.choose()")
+        settled(tab)
+        near = tab.run("swathViewer.drawn")
+        tab.run("swathViewer.camera.centre[0] += 500; swathViewer.turned()")
+        settled(tab)
+        assert tab.run("swathViewer.drawn") == 0
+        assert 0 < near < POINTS
+        assert tab.said == []
+
+
+@needs_browser
+def test_a_lasso_changes_classes_of_a_copy_and_nothing_else(tab: Page, clouds: Clouds, tmp_path: Path) -> None:
+    plain, out = clouds(POINTS)[0], tmp_path / "edited.laz"
+    with viewed(plain, "--edited", out) as (address, process):
+        tab.open(address)
+        settled(tab)
+        tab.run("swathViewer.camera.above(); swathViewer.turned()")
+        settled(tab)
+        tab.run("document.getElementById('to-class').value = '9'")
+        tab.press("#lasso")
+        assert tab.run("swathViewer.mode") == "lasso"
+        # around the house, whose corners are known
+        corners = [(42.0, 23.0), (58.0, 23.0), (58.0, 37.0), (42.0, 37.0), (42.0, 30.0)]
+        origin = np.array(tab.run("swathViewer.scene.origin"))
+        ground = [np.array([533_000.0 + x, 6_472_000.0 + y, 60.0]) - origin for x, y in corners]
+        places = [tab.run(f"swathViewer.project(swathViewer.view, {json.dumps(each.tolist())})") for each in ground]
+        tab.drag([(x, y) for x, y, _ in places])
+        tab.until("swathViewer.editing.edits.length == 1")
+        shown = tab.run(
+            "[...swathViewer.renderer.chunks.values()].map(c => c.bytes.classification.filter((v, i) => v !== c.original[i]).length)"
+            ".reduce((a, b) => a + b, 0)"
+        )
+        pixels = tab.pixels()
+        assert (abs(pixels.astype(int) - [0x4A, 0x90, 0xE2]).max(axis=2) < 40).sum() > 500  # water is blue
+        # one more, taken back
+        tab.drag([(500, 300), (560, 300), (560, 360)])
+        tab.until("swathViewer.editing.edits.length == 2")
+        tab.press("#undo")
+        tab.until("swathViewer.editing.edits.length == 1")
+        loop = np.array(tab.run("swathViewer.editing.edits[0].loop"))
+        matrix = np.array(tab.run("swathViewer.editing.edits[0].matrix")).reshape(4, 4).T
+        tab.press("#save")
+        tab.until("document.getElementById('edit-note').textContent.includes('saved to')")
+        assert tab.said == []
+    assert process.returncode == 0
+    before, after = laspy.read(plain), laspy.read(out)
+    for name in before.point_format.dimension_names:
+        if name != "classification":
+            np.testing.assert_array_equal(before[name], after[name], err_msg=name)
+    changed = np.asarray(after.classification) != np.asarray(before.classification)
+    assert set(np.asarray(after.classification)[changed].tolist()) == {9}
+    # what was seen to change is what changed: single precision may move a point over the line
+    assert abs(int(changed.sum()) - shown) <= 3
+    # inside and outside by shapely, in the same picture
+    from shapely import Polygon, contains_xy
+
+    flat = np.column_stack([before.xyz - origin, np.ones(POINTS)]) @ matrix.T
+    inside = contains_xy(Polygon(loop), flat[:, 0] / flat[:, 3], flat[:, 1] / flat[:, 3])
+    np.testing.assert_array_equal(changed, inside)
+    assert changed.sum() > 1000
+
+
+@needs_browser
+def test_loops_that_were_not_saved_are_said(tab: Page, clouds: Clouds, tmp_path: Path) -> None:
+    with viewed(clouds(POINTS)[1], "--edited", tmp_path / "x.laz") as (address, process):
+        tab.open(address)
+        settled(tab)
+        tab.press("#lasso")
+        tab.drag([(500, 300), (620, 300), (620, 420)])
+        tab.until("swathViewer.editing.edits.length == 1")
+        tab.run("swathViewer.editing.sent")
+        tab.open("about:blank")
+        process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        assert "1 loop(s) of the lasso were not saved" in process.stderr.read()
+    assert not (tmp_path / "x.laz").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["{folder}"], "holds no cloud.copc.laz or cloud.laz"),
+        (["{folder}/none.laz"], "no such file"),
+        (["{cloud}", "--edited", "{folder}/x.ply"], "ends in .ply, expected a name that ends in .laz or .las"),
+        (["{cloud}", "--edited", "{folder}/x.copc.laz"], "`swath export` makes a COPC of it"),
+        (["{cloud}", "--edited", "{cloud}"], "is an input and cannot be the output too"),
+        (["{cloud}", "--force"], "--force given, but nothing uses it"),
+        (["{cloud}", "--port", "70000"], "expected 0 (any free one) to 65535"),
+    ],
+)
+def test_what_cannot_be_viewed_is_one_sentence(
+    clouds: Clouds, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    told = [word.format(folder=tmp_path, cloud=clouds(3_000)[0]) for word in words]
+    assert main(["view", *told]) in (1, 2)
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
