@@ -17,7 +17,7 @@ GROUP: Final = "swath.commands"
 OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
 _INTERRUPTED: Final = 128 + signal.SIGINT
 _TERMINATED: Final = 128 + signal.SIGTERM
-_BROKEN_PIPE: Final = 128 + signal.SIGPIPE
+_BROKEN_PIPE: Final = 128 + 13  # SIGPIPE, which is not on every system
 _LONGEST: Final = 4000
 """Characters of a sentence on the terminal."""
 
@@ -58,6 +58,7 @@ class Terminated(KeyboardInterrupt):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `swath` and give its exit code: 0, 1 for what went wrong outside, 2 for a wrong command line."""
     words = list(sys.argv[1:] if argv is None else argv)
+    _make_legible()
     try:
         with _terminable():
             code = _dispatch(words)
@@ -74,6 +75,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         sentence, code = _outside(error)
         _say(sentence)
     return code
+
+
+def _make_legible() -> None:
+    """Signs that the console's encoding lacks are shown by their numbers, so that no sentence ends in an error."""
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure = getattr(stream, "reconfigure", None)
+        if reconfigure is not None and getattr(stream, "errors", "") == "strict":
+            reconfigure(errors="backslashreplace")
 
 
 def _say(sentence: str) -> None:

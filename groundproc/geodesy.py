@@ -16,6 +16,7 @@ import pyproj
 from pyproj.exceptions import CRSError, ProjError
 
 from flightlog.errors import GeodesyError
+from groundproc import system
 
 Array = npt.NDArray[np.float64]
 
@@ -193,7 +194,7 @@ def _grid_undulation(path: Path, latitude_deg: float, longitude_deg: float) -> f
     # in a pipeline commas part grids and quotes end them; under a plain name any path will do
     with tempfile.TemporaryDirectory(prefix="swath-geoid-") as folder:
         plain = Path(folder) / f"geoid{path.suffix if path.suffix[1:].isalnum() else ''}"
-        plain.symlink_to(path.resolve())
+        system.linked(plain, path)
         pipeline = (
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
             f'+step +inv +proj=vgridshift +grids="{plain}" +multiplier=1'

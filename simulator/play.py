@@ -3,15 +3,11 @@
 To whoever records, it is the sensor's network and the autopilot's serial port.
 """
 
-import fcntl
 import heapq
 import os
-import pty
 import socket
 import struct
-import termios
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -22,6 +18,13 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError, SourceError
 from flightlog.hdl32e import DATA_PORT
 
+with suppress(ImportError):  # not on every system
+    import fcntl
+    import pty
+    import termios
+    import tty
+
+TERMINALS: Final = "pty" in globals()
 _PCAP_HEAD: Final = 24
 _FRAME_HEAD: Final = 42
 _SLICE_S: Final = 0.002
@@ -121,6 +124,8 @@ def play(
     SourceError
         The link to the terminal or the address is not possible.
     """
+    if not TERMINALS:
+        raise SourceError("this system has no pseudo terminals: `swath replay` sends what was simulated to UDP instead")
     with ExitStack() as stack:
         master, slave = pty.openpty()
         stack.callback(os.close, master)

@@ -149,7 +149,7 @@ def _pipe(pipe: IO[str] | None) -> IO[str]:
 
 def ended(code: int) -> str:
     """Why a process ended that said nothing."""
-    if code == -signal.SIGXCPU:
+    if code < 0 and signal.Signals(-code).name == "SIGXCPU":
         return "unpacking its points does not come to an end"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     return f"unpacking its points failed with {name}"

@@ -8,7 +8,6 @@ many bytes from there on in the file. `ok` on the standard output says that they
 
 import json
 import mmap
-import resource
 import sys
 from typing import Any, Final, NamedTuple
 
@@ -56,6 +55,8 @@ def _answer(text: str) -> None:
 
 def _allow(points: int) -> None:
     """Let the processor's time for the next points run from now."""
+    import resource  # not on every system, and where it is not, nobody runs this
+
     used = resource.getrusage(resource.RUSAGE_SELF)
     end = int(used.ru_utime + used.ru_stime) + _PATIENCE_CPU_S + points // _POINTS_PER_CPU_S
     resource.setrlimit(resource.RLIMIT_CPU, (end, resource.RLIM_INFINITY))
@@ -88,6 +89,8 @@ def main() -> None:
     """Unpack until there is nothing more to read."""
     sys.path.append(sys.argv[1])
     task = Task(**json.loads(sys.argv[2]))
+    import resource
+
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (task.memory_bytes, task.memory_bytes))
     try:

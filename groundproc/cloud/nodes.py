@@ -7,6 +7,7 @@ import contextlib
 import mmap
 import os
 import struct
+import subprocess
 import threading
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,10 +16,12 @@ from types import TracebackType
 from typing import BinaryIO, Final, Self
 
 import laspy
+import lazrs
 import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError
+from groundproc import system
 from groundproc.cloud import laz, reader
 from groundproc.cloud.lazworker import Task
 from groundproc.cloud.points import Points
@@ -168,6 +171,10 @@ class NodeReader:
         point_bytes = int(self._form.size)
         most = max(node.points for node in octree.nodes.values()) * point_bytes
         self._bytes = most + -most % mmap.ALLOCATIONGRANULARITY
+        self._vlr = vlr
+        self._child: subprocess.Popen[str] | None = None
+        if not system.LIMITED:
+            return
         shared = laz.shared_memory(self._bytes * 2)
         self._task = Task(
             str(cloud.path), 0, vlr.hex(), point_bytes, shared, self._bytes, _MEMORY_BYTES + 2 * self._bytes, False
@@ -181,6 +188,8 @@ class NodeReader:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._child is None:
+            return
         self._child.kill()
         self._child.communicate()
         self._memory.close()
@@ -204,6 +213,8 @@ class NodeReader:
 
     def _unpacked(self, node: Node) -> bytes:
         child = self._child
+        if child is None:
+            return self._unpacked_here(node)
         assert child.stdin is not None
         assert child.stdout is not None
         answer = ""
@@ -219,3 +230,16 @@ class NodeReader:
             reason = answer.strip() or laz.ended(child.returncode)
             raise CaptureError(f"{self._cloud.path}: node {key} is damaged ({reason})")
         return bytes(memoryview(self._memory)[: node.points * self._task.point_bytes])
+
+    def _unpacked_here(self, node: Node) -> bytes:
+        """The same in this process, on a system where no other can be given limits."""
+        points = bytearray(node.points * int(self._form.size))
+        try:
+            with self._cloud.path.open("rb") as file:
+                file.seek(node.place)
+                packed = file.read(node.size)
+            lazrs.decompress_points_with_chunk_table(packed, self._vlr, points, [(node.points, len(packed))])
+        except (OSError, lazrs.LazrsError) as error:
+            key = "-".join(map(str, node.key))
+            raise CaptureError(f"{self._cloud.path}: node {key} is damaged ({error})") from None
+        return bytes(points)

@@ -17,6 +17,7 @@ from pyproj.exceptions import CRSError
 
 from flightlog.errors import CaptureError
 from flightlog.words import clean
+from groundproc import system
 from groundproc.cloud import lashead, laz
 from groundproc.cloud.dimensions import TABLE, Dimension, in_order
 from groundproc.cloud.gpstime import Clock, is_week_time
@@ -250,7 +251,8 @@ def opened(path: Path) -> Iterator[Any]:
     try:
         lashead.check(path)
         reader = laspy.open(path)
-        reader.laz_backend = laz.Backend(path, _at_once(reader.header))
+        if system.LIMITED:  # else in this process: what aborts takes all of it
+            reader.laz_backend = laz.Backend(path, _at_once(reader.header))
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from None
     except DAMAGE as error:

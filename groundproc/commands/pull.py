@@ -25,8 +25,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pull; 0 when every closed segment is here and right, else 1."""
+    import shutil
+
+    from flightlog.errors import SourceError
+    from groundproc import system
     from groundproc.field.pull import Vehicle, pull
 
+    missing = [name for name in ("ssh", "rsync") if shutil.which(name) is None]
+    if missing or not system.LIMITED:
+        why = f"{' and '.join(missing)} not found" if missing else "this system cannot give them limits"
+        raise SourceError(
+            f"pull: needs ssh and rsync on a Linux or macOS system, and {why}; install them (Debian: openssh-client, rsync), "
+            "on Windows within WSL"
+        )
     vehicle = Vehicle(arguments.host, arguments.port, arguments.identity, arguments.ssh_config)
 
     def say(sentence: str) -> None:

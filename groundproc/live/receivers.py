@@ -5,10 +5,9 @@ import os
 import selectors
 import socket
 import struct
-import termios
+import sys
 import threading
 import time
-import tty
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from typing import Final
@@ -18,6 +17,12 @@ from flightlog.errors import SourceError, UsageError
 from flightlog.hdl32e import DATA_BYTES, POSITION_BYTES
 from groundproc.live.inbox import Inbox, LogClock, Received, scan_packets
 
+with suppress(ImportError):  # not on every system: there it listens to recordings only
+    import termios
+    import tty
+
+LISTENS: Final = sys.platform == "linux" and "termios" in globals()
+"""Whether this system tells when a datagram came, and has serial devices as files."""
 _SO_TIMESTAMPNS: Final = 35
 _SO_RXQ_OVFL: Final = 40
 _BUFFER_BYTES: Final = 8 << 20
@@ -29,9 +34,11 @@ _PAUSE_S: Final = 0.004
 _RETRY_S: Final = 1.0
 _OTHER_S: Final = 10.0
 """After so long a silence another sender is taken for the lidar."""
-_BAUDS: Final = {
-    int(name[1:]): getattr(termios, name) for name in dir(termios) if name.startswith("B") and name[1:].isdecimal()
-}
+_BAUDS: Final = (
+    {int(name[1:]): getattr(termios, name) for name in dir(termios) if name.startswith("B") and name[1:].isdecimal()}
+    if LISTENS
+    else {}
+)
 Chunk = tuple[int, bytes]
 
 
@@ -240,6 +247,10 @@ class Receivers:
     def __init__(
         self, inbox: Inbox, address: str, lidar_port: int, position_port: int, mavlink: str, baud: int
     ) -> None:
+        if not LISTENS:
+            raise SourceError(
+                "this system does not say when a datagram came, as Linux does: `swath live --follow LOG` shows a log that grows"
+            )
         self._inbox, self._stop, self._counts = inbox, threading.Event(), Counts()
         clock = LogClock()
         self._ports: list[Port] = []

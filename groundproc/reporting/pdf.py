@@ -38,7 +38,7 @@ def print_pdf(page: Path, out: Path) -> None:
 def _by_browser(program: str, page: Path, out: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="swath-print-") as folder:
         # of no use, and refused, where root runs it; the page is ours and lets nothing in
-        own = ["--no-sandbox"] if os.geteuid() == 0 else []
+        own = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
         command = [
             program, *_FLAGS, *own, f"--user-data-dir={folder}/profile", f"--print-to-pdf={out.resolve()}",
             page.resolve().as_uri(),

@@ -6,7 +6,6 @@ is ours.
 """
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
@@ -17,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from flightlog.errors import SourceError, UsageError
+from groundproc import system
 from groundproc.files import written_aside
 
 INSIDE: Final = ".swath"
@@ -263,7 +263,7 @@ def sweep(folder: Path) -> None:
     for place in (folder, folder / INSIDE):
         for path in place.glob(".*.part"):
             number = path.name.removesuffix(".part").rpartition(".")[2]
-            if not number.isdecimal() or (int(number) != os.getpid() and _alive(int(number))):
+            if not number.isdecimal() or (int(number) != os.getpid() and system.alive(int(number))):
                 continue
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -284,16 +284,6 @@ def staging(folder: Path, step: str) -> Path:
 def staged_by_anyone(folder: Path, step: str) -> Iterator[Path]:
     """Folders that a step wrote into, of this process or of one that died."""
     return (folder / INSIDE).glob(f".{step}.*.part")
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True
 
 
 def _plain(mark: Fingerprint) -> dict[str, Any]:
@@ -332,11 +322,9 @@ def locked(folder: Path) -> Iterator[None]:
     UsageError
         Another process works there.
     """
-    place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(system.locked(folder))
+        except BlockingIOError:
+            raise UsageError(f"{folder}: another process is at work there") from None
         yield
-    except BlockingIOError:
-        raise UsageError(f"{folder}: another process is at work there") from None
-    finally:
-        os.close(place)

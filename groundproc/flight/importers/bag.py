@@ -18,7 +18,7 @@ from flightlog import hdl32e, records
 from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
 from flightlog.words import clean
-from groundproc import packed
+from groundproc import packed, system
 from groundproc.flight.importers.inputs import hash_of
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.kinds import BAG, HEAD_BYTES, MCAP, Kind, kind_of
@@ -234,7 +234,7 @@ def _named(path: Path, folder: Path) -> tuple[Path, str]:
     if content.suffix == suffix:
         return content, damage
     link = folder / f"{len(list(folder.iterdir()))}{suffix}"
-    link.symlink_to(content.resolve())
+    system.linked(link, content)
     return link, damage
 
 

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from flightlog.config import option
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SourceError, SwathError, UsageError
+from groundproc import system
 from groundproc.files import written_aside
 from groundproc.flight.positions import rinex
 from groundproc.flight.positions.combine import Combined, combined, refuted
@@ -256,7 +257,7 @@ def _taken(path: Path, stem: str, folder: Path) -> list[_Input]:
     if kind in ("observations", "navigation"):
         link = folder / f"{stem}.{'obs' if kind == 'observations' else 'nav'}"
         if is_plain(whole):
-            link.symlink_to(whole.resolve())
+            system.linked(link, whole)
         else:  # RTKLIB looks at columns of plain text
             make_plain(whole, link)
         return [_Input(path.name, kind, link)]

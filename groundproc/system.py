@@ -1,0 +1,80 @@
+"""What systems do differently: locks, processes, links. All else of the ground tool is the same on each of them."""
+
+import contextlib
+import ctypes
+import importlib
+import importlib.util
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+LIMITED: Final = os.name == "posix" and importlib.util.find_spec("resource") is not None
+"""Whether a process can be started that has limits and shares memory by a descriptor."""
+_QUERY: Final = 0x1000
+_STILL_ACTIVE: Final = 259
+"""Of Windows: PROCESS_QUERY_LIMITED_INFORMATION, and the exit code of what runs."""
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs."""
+    if os.name == "nt":  # there a signal of 0 would end it
+        return _alive_on_windows(pid)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def _alive_on_windows(pid: int) -> bool:
+    kernel: Any = getattr(ctypes, "windll").kernel32  # noqa: B009 - it is there on Windows only
+    handle = kernel.OpenProcess(_QUERY, False, pid)
+    if not handle:
+        return False
+    code = ctypes.c_ulong()
+    kernel.GetExitCodeProcess(handle, ctypes.byref(code))
+    kernel.CloseHandle(handle)
+    return code.value == _STILL_ACTIVE
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a folder; the system lets go when this process ends, however it ends.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process holds it.
+    """
+    if importlib.util.find_spec("fcntl") is not None:
+        import fcntl
+
+        place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        finally:
+            os.close(place)
+        return
+    if importlib.util.find_spec("msvcrt") is None:  # a system without locks of either kind
+        yield
+        return
+    windows: Any = importlib.import_module("msvcrt")
+    with (folder / ".lock").open("ab") as file:
+        try:
+            windows.locking(file.fileno(), windows.LK_NBLCK, 1)
+        except OSError:
+            raise BlockingIOError from None
+        yield
+
+
+def linked(link: Path, target: Path) -> None:
+    """Another name for a file: a link, or a copy where the user may make none."""
+    try:
+        link.symlink_to(target.resolve())
+    except (OSError, NotImplementedError):
+        shutil.copyfile(target, link)
