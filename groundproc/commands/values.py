@@ -35,3 +35,19 @@ def count(text: str, word: str) -> int:
     if not (text.isdecimal() and 1 <= int(text) <= 10_000):
         raise UsageError(f"{word} {text!r}: expected a whole number of 1 to 10000")
     return int(text)
+
+
+def numbers(text: str, word: str, count: int, example: str) -> tuple[float, ...]:
+    """Numbers between commas, such as a place "533000,6472000".
+
+    Raises
+    ------
+    UsageError
+    """
+    try:
+        found = tuple(float(each) for each in text.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise UsageError(f"{word} {text!r}: expected {count} numbers between commas, {example}")
+    return found

@@ -51,6 +51,7 @@ def write(
     crs: pyproj.CRS | None,
     band: Band,
     block: Callable[[Window], npt.NDArray[Any]],
+    corner_m: tuple[float, float] | None = None,
 ) -> None:
     """Write a raster of one band, a block at a time.
 
@@ -63,6 +64,8 @@ def write(
     band : Band
     block : callable
         Gives the values of a window, shape (rows, columns), the first row in the north; NaN where there is none.
+    corner_m : tuple of 2 floats, optional
+        West and north edge, where they are no whole multiples of the cell: those of another program's raster.
 
     Raises
     ------
@@ -72,7 +75,7 @@ def write(
     plain = path.with_name(f"{path.name}.plain")
     profile = {
         "driver": "GTiff", "width": grid.columns, "height": grid.rows, "count": 1, "dtype": band.dtype,
-        "nodata": band.no_data, "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "nodata": band.no_data, "transform": from_origin(*(corner_m or (grid.west_m, grid.north_m)), grid.cell_m, grid.cell_m),
         "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "bigtiff": "IF_SAFER", "sparse_ok": True,
     }  # fmt: skip
     if crs is not None:

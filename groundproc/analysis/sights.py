@@ -1,0 +1,212 @@
+"""From a surface or a cloud and a place to a raster of what is seen."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+import shapely
+
+from flightlog.errors import CoverageError, UsageError
+from groundproc.analysis import voxelsight
+from groundproc.analysis.viewshed import EXACT, FAST, UNKNOWN, VISIBLE, Sight, bend_per_m, height_at, viewshed
+from groundproc.cloud import reader
+from groundproc.files import written_aside
+from groundproc.raster import geotiff
+from groundproc.raster.cells import Cells
+from groundproc.raster.geotiff import Band
+from groundproc.raster.grid import Grid, Window, checked_cell
+from groundproc.raster.relief import filled
+from groundproc.raster.work import common_crs
+from groundproc.vectors.features import read_features
+
+Array = npt.NDArray[np.float64]
+
+VOXELS: Final = "voxels"
+MODES: Final = (EXACT, FAST, VOXELS)
+SUFFIXES: Final = (".tif", ".tiff")
+_CELL_M: Final = 0.5
+_GAP_M: Final = 1.0
+"""Gaps of a cloud's surface that are bridged, as in hillshades."""
+_MOST_CELLS: Final = 400_000_000
+"""Cells that are held in memory at once: lines go everywhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is asked for.
+
+    Attributes
+    ----------
+    source : Path
+        A raster of heights, or a cloud.
+    output : Path
+    at_m : tuple of 2 floats or None
+        Easting and northing.
+    path : Path or None
+        Lines to look from, in place of one place.
+    step_m : float
+        Between the places along a line.
+    height_m, target_m : float
+        Observer and targets over the surface.
+    mode : str
+    reverse : bool
+        What sees the place, in place of what is seen from it: observers stand on the cells.
+    curved : bool
+        Earth and refraction.
+    cell_m : float or None
+        For clouds.
+    trajectory : Path or None
+        Of a cloud, for voxels: then rays are those of the flight.
+    """
+
+    source: Path
+    output: Path
+    at_m: tuple[float, float] | None
+    path: Path | None
+    step_m: float
+    height_m: float
+    target_m: float
+    mode: str
+    reverse: bool
+    curved: bool
+    cell_m: float | None
+    trajectory: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Heights in memory, and where they are."""
+
+    height_m: npt.NDArray[np.floating[Any]]
+    west_m: float
+    north_m: float
+    grid: Grid
+    crs: pyproj.CRS | None
+    warnings: tuple[str, ...] = ()
+
+    def cell(self, place_m: Sequence[float]) -> tuple[float, float]:
+        """Column and row of a place, from the centre of the first cell."""
+        return (place_m[0] - self.west_m) / self.grid.cell_m - 0.5, (self.north_m - place_m[1]) / self.grid.cell_m - 0.5
+
+
+def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
+    """Make the raster, and give its figures.
+
+    Raises
+    ------
+    SwathError
+        What is asked for cannot be, or a file is not as it should be.
+    """
+    if task.mode not in MODES:
+        raise UsageError(f"--mode {task.mode}: expected {', '.join(MODES)}")
+    if (task.at_m is None) == (task.path is None):
+        raise UsageError("expected a place with --at E,N, or lines with --path FILE, and not both")
+    if task.mode == VOXELS:
+        return voxelsight.run(task, progress)
+    surface = _surface(task, progress)
+    places = _places(task, surface)
+    seen = np.zeros(surface.height_m.shape, np.float32)
+    known = np.zeros(surface.height_m.shape, np.bool_)
+    above, target = (task.target_m, task.height_m) if task.reverse else (task.height_m, task.target_m)
+    for place in places:
+        column, row = surface.cell(place)
+        sight = Sight(column, row, above, target, bend_per_m(task.curved), surface.grid.cell_m)
+        one = viewshed(surface.height_m, sight, task.mode)
+        seen += one == VISIBLE
+        known |= one != UNKNOWN
+        progress(1)
+    one_place = task.path is None
+    values = np.where(known, seen, np.nan)
+    band = Band("visible" if one_place else "places that see it", "", "uint8", float(UNKNOWN), "nearest")
+    if not one_place:
+        band = Band("places that see it", "", "float32")
+
+    def block(window: Window) -> npt.NDArray[Any]:
+        top = surface.grid.row + surface.grid.rows - window.row - window.rows
+        left = window.column - surface.grid.column
+        return values[top : top + window.rows, left : left + window.columns]
+
+    with written_aside(task.output) as aside:
+        geotiff.write(aside, surface.grid, surface.crs, band, block, corner_m=(surface.west_m, surface.north_m))
+    area = surface.grid.cell_m**2
+    return {
+        "mode": task.mode, "places": len(places), "cells": int(known.size), "visible_cells": int((seen > 0).sum()),
+        "unknown_cells": int((~known).sum()), "visible_m2": float((seen > 0).sum() * area), "warnings": list(surface.warnings),
+    }  # fmt: skip
+
+
+def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
+    if task.source.suffix.lower() in SUFFIXES:
+        if task.cell_m is not None:
+            raise UsageError(f"--cell {task.cell_m:g}: is for clouds; {task.source} has cells of its own")
+        with geotiff.opened(task.source) as raster:
+            _check_size(raster.grid)
+            heights = raster.window(raster.grid)
+            return Surface(heights, raster.west_m, raster.north_m, raster.grid, raster.crs)
+    cell_m = checked_cell(task.cell_m or _CELL_M)
+    cloud = reader.look(task.source)
+    crs, warnings = common_crs([cloud], None)
+    cells = Cells(cell_m, {"max"})
+    for chunk in reader.chunks(cloud, columns=()):
+        cells.add(chunk.points.xyz_m, chunk.points.xyz_m[:, 2])
+        progress(len(chunk.points))
+    grid = cells.grid()
+    assert grid is not None
+    _check_size(grid)
+    heights = filled(cells.window(grid, "max"), max(round(_GAP_M / cell_m), 1))
+    return Surface(heights, grid.west_m, grid.north_m, grid, crs, warnings)
+
+
+def _check_size(grid: Grid) -> None:
+    if grid.columns * grid.rows > _MOST_CELLS:
+        raise UsageError(
+            f"{grid.columns} x {grid.rows} cells found, expected at most {_MOST_CELLS:,} for lines of sight; cut out the part of "
+            "interest, or choose larger cells"
+        )
+
+
+def _places(task: Task, surface: Surface) -> list[tuple[float, float]]:
+    """Places of the observer.
+
+    Raises
+    ------
+    CoverageError
+        There is no surface at one place, or at any of a path.
+    """
+    rows, columns = surface.height_m.shape
+
+    def known(place: tuple[float, float]) -> bool:
+        column, row = surface.cell(place)
+        inside = -0.5 <= column <= columns - 0.5 and -0.5 <= row <= rows - 0.5
+        return inside and bool(np.isfinite(height_at(surface.height_m, column, row)))
+
+    places = [task.at_m] if task.at_m is not None else along(task, surface.crs)
+    found = [place for place in places if known(place)]
+    if not found:
+        cell, (west, north) = surface.grid.cell_m, (surface.west_m, surface.north_m)
+        raise CoverageError(
+            f"{places[0][0]:.2f},{places[0][1]:.2f}: the surface has no height there, expected a place within {west:.2f} to "
+            f"{west + columns * cell:.2f} E and {north - rows * cell:.2f} to {north:.2f} N with heights around it"
+        )
+    return found
+
+
+def along(task: Task, crs: pyproj.CRS | None) -> list[tuple[float, float]]:
+    """Places along the lines of a file, and their ends."""
+    assert task.path is not None
+    if not task.step_m > 0.0:
+        raise UsageError(f"--step {task.step_m:g} m: expected more than 0")
+    features = read_features(task.path, "LineString")
+    if crs is not None:
+        features = features.into(crs)
+    found = []
+    for line in features.geometry:
+        count = max(int(np.ceil(line.length / task.step_m)), 1)
+        for share in np.linspace(0.0, 1.0, count + 1):
+            point = shapely.line_interpolate_point(line, share, normalized=True)
+            found.append((float(point.x), float(point.y)))
+    return found

@@ -1,0 +1,196 @@
+"""Line of sight through leaves: transmittance of voxels, from the beams that went through them.
+
+A voxel lets through the share of beams that entered it and were not thrown back in it. Beams are those of the flight where its
+trajectory is given, else vertical ones from above the cloud. Between two places the shares multiply, each to the power of the way in
+its voxel over its edge. The voxels that hold the two ends are left out: what one stands on does not hide one.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from flightlog.errors import CoverageError, UsageError
+from groundproc.cloud import reader
+from groundproc.files import written_aside
+from groundproc.radiometry import sensorpath
+from groundproc.raster import geotiff
+from groundproc.raster.geotiff import Band
+from groundproc.raster.grid import Grid, Window, checked_cell
+from groundproc.raster.work import common_crs
+
+if TYPE_CHECKING:
+    from groundproc.analysis.sights import Task
+
+Array = npt.NDArray[np.float64]
+
+_EDGE_M: Final = 0.5
+_MOST: Final = 400_000_000
+
+
+def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
+    """Transmittance from a place, or its mean over the places of a path, to every cell.
+
+    Raises
+    ------
+    SwathError
+    """
+    if task.source.suffix.lower() in (".tif", ".tiff"):
+        raise UsageError(f"{task.source}: is a raster; --mode voxels looks through a cloud")
+    edge_m = checked_cell(task.cell_m or _EDGE_M)
+    cloud = reader.look(task.source)
+    crs, warnings = common_crs([cloud], None)
+    path = None if task.trajectory is None else sensorpath.flown([cloud], task.trajectory)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for chunk in reader.chunks(cloud, columns=()):
+        low, high = np.minimum(low, chunk.points.xyz_m.min(axis=0)), np.maximum(high, chunk.points.xyz_m.max(axis=0))
+        progress(len(chunk.points))
+    first = np.floor(low / edge_m).astype(np.int64)
+    shape = np.floor(high / edge_m).astype(np.int64) - first + 1
+    if int(np.prod(shape)) > _MOST:
+        raise UsageError(
+            f"{task.source}: {shape[0]} x {shape[1]} x {shape[2]} voxels of {edge_m:g} m found, expected at most {_MOST:,}; choose a "
+            "larger --cell, or cut out the part of interest with `swath section`"
+        )
+    hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+    ground = np.full((shape[0], shape[1]), np.inf)
+    for chunk in reader.chunks(cloud, None if path is None else path.clock, ()):
+        local = chunk.points.xyz_m / edge_m - first
+        if path is None:
+            away, known = np.tile([0.0, 0.0, 1.0], (len(local), 1)) * float(shape[2] + 1), np.ones(len(local), np.bool_)
+        else:
+            sensor, known = path.at(chunk)
+            away = sensor / edge_m - first - local
+        last = np.asarray(chunk.record.return_number) >= np.asarray(chunk.record.number_of_returns)
+        _beams(local[known], away[known], last[known], hits, passes)
+        _lowest(local, chunk.points.xyz_m[:, 2], ground)
+        progress(len(chunk.points))
+    through = np.ones(shape, np.float32)
+    met = hits + passes
+    np.divide(passes, met, out=through, where=met > 0)
+    grid = Grid(int(first[0]), int(first[1]), int(shape[0]), int(shape[1]), edge_m)
+    total = np.zeros((shape[0], shape[1]))
+    places = _places(task, crs, ground, first, edge_m)
+    for place in places:
+        one = np.full((shape[0], shape[1]), np.nan)
+        above, target = (task.target_m, task.height_m) if task.reverse else (task.height_m, task.target_m)
+        i, j = int(np.floor(place[0] / edge_m)) - first[0], int(np.floor(place[1] / edge_m)) - first[1]
+        eye = (place[0] / edge_m - first[0], place[1] / edge_m - first[1], (ground[i, j] + above) / edge_m - first[2])
+        _transmittance(through, ground / edge_m - first[2], eye, target / edge_m, one)
+        total += one / len(places)
+        progress(1)
+    image = total.T[::-1].astype(np.float32)
+
+    def block(window: Window) -> npt.NDArray[Any]:
+        top, left = grid.row + grid.rows - window.row - window.rows, window.column - grid.column
+        return image[top : top + window.rows, left : left + window.columns]
+
+    with written_aside(task.output) as aside:
+        geotiff.write(aside, grid, crs, Band("transmittance"), block)
+    seen = np.isfinite(image)
+    return {
+        "mode": task.mode, "places": len(places), "cells": int(image.size), "unknown_cells": int((~seen).sum()),
+        "mean_transmittance": float(image[seen].mean()) if seen.any() else None, "warnings": list(warnings),
+    }  # fmt: skip
+
+
+def _places(task: "Task", crs: Any, ground: Array, first: Any, edge_m: float) -> list[tuple[float, float]]:
+    from groundproc.analysis.sights import along
+
+    places = [task.at_m] if task.at_m is not None else along(task, crs)
+    found = []
+    for place in places:
+        i, j = int(np.floor(place[0] / edge_m)) - first[0], int(np.floor(place[1] / edge_m)) - first[1]
+        if 0 <= i < ground.shape[0] and 0 <= j < ground.shape[1] and np.isfinite(ground[i, j]):
+            found.append(place)
+    if not found:
+        raise CoverageError(
+            f"{places[0][0]:.2f},{places[0][1]:.2f}: the cloud has no point there, expected a place within it"
+        )
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _lowest(local: Any, z: Any, ground: Any) -> None:
+    for n in range(len(local)):
+        i, j = int(local[n, 0]), int(local[n, 1])
+        ground[i, j] = min(ground[i, j], z[n])
+
+
+@njit(cache=True, nogil=True)
+def _beams(local: Any, away: Any, last: Any, hits: Any, passes: Any) -> None:
+    """Count beams that end in voxels, and those that go through: from the echo towards the sensor until they leave the grid.
+
+    Of a beam with several echoes only the last is followed; at the others it was thrown back in part.
+    """
+    for n in range(len(local)):
+        i, j, k = int(local[n, 0]), int(local[n, 1]), int(local[n, 2])
+        hits[i, j, k] += 1
+        if not last[n]:
+            continue
+        dx, dy, dz = away[n, 0], away[n, 1], away[n, 2]
+        step = np.array([1 if dx > 0 else -1, 1 if dy > 0 else -1, 1 if dz > 0 else -1])
+        at, way = np.array([i, j, k]), np.array([dx, dy, dz])
+        following, each = np.full(3, np.inf), np.full(3, np.inf)
+        for a in range(3):
+            if way[a] != 0.0:
+                edge = at[a] + (1 if step[a] > 0 else 0)
+                following[a], each[a] = (edge - local[n, a]) / way[a], 1.0 / abs(way[a])
+        while True:
+            a = (
+                0
+                if following[0] <= following[1] and following[0] <= following[2]
+                else 1
+                if following[1] <= following[2]
+                else 2
+            )
+            if following[a] >= 1.0:
+                break
+            at[a] += step[a]
+            if at[a] < 0 or at[a] >= hits.shape[a]:
+                break
+            following[a] += each[a]
+            passes[at[0], at[1], at[2]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _transmittance(through: Any, ground: Any, eye: Any, target: float, out: Any) -> None:
+    """Product over the voxels between the observer and each target, both in voxels."""
+    for i1 in range(out.shape[0]):
+        for j1 in range(out.shape[1]):
+            if not np.isfinite(ground[i1, j1]):
+                continue
+            end = np.array([i1 + 0.5, j1 + 0.5, ground[i1, j1] + target])
+            start = np.array([eye[0], eye[1], eye[2]])
+            way = end - start
+            length = np.sqrt((way * way).sum())
+            at, last = np.floor(start).astype(np.int64), np.floor(end).astype(np.int64)
+            begin = at.copy()
+            following, each, step = np.full(3, np.inf), np.full(3, np.inf), np.ones(3, np.int64)
+            for a in range(3):
+                if way[a] != 0.0:
+                    step[a] = 1 if way[a] > 0 else -1
+                    following[a] = (at[a] + (1 if step[a] > 0 else 0) - start[a]) / way[a]
+                    each[a] = 1.0 / abs(way[a])
+            share, value = 0.0, 1.0
+            while share < 1.0 and value > 1e-6:
+                a = (
+                    0
+                    if following[0] <= following[1] and following[0] <= following[2]
+                    else 1
+                    if following[1] <= following[2]
+                    else 2
+                )
+                reach = min(following[a], 1.0)
+                inside = True
+                for b in range(3):
+                    inside = inside and 0 <= at[b] < through.shape[b]
+                own = (at == begin).all() or (at == last).all()
+                if inside and not own:
+                    value *= np.float64(through[at[0], at[1], at[2]]) ** ((reach - share) * length)
+                share = reach
+                at[a] += step[a]
+                following[a] += each[a]
+            out[i1, j1] = value if value > 1e-6 else 0.0
