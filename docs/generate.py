@@ -2,11 +2,13 @@
 
 log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
 groundproc/products, survey.md from the dataclasses of groundproc/survey, the table in methods/observations.md from the registry of
-groundproc/estimation/observations. Run it after a change of these: python docs/generate.py
+groundproc/estimation/observations. health.schema.json is made from onboard/health.py. Run it after a
+change of these: python docs/generate.py
 """
 
 import dataclasses
 import importlib
+import json
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,6 +22,7 @@ from groundproc.estimation import observations
 from groundproc.survey import SECTIONS, Survey, sample
 from groundproc.survey.dynamic import DynamicOptions
 from groundproc.survey.setting import command_of, default_of, value_text
+from onboard import healthschema
 
 DOCS: Final = Path(__file__).parent
 
@@ -267,9 +270,14 @@ def _cell(field: "dataclasses.Field[Any]") -> str:
     return about.replace("|", "\\|")
 
 
+def health_schema() -> str:
+    """health.schema.json, from the records of onboard/health.py."""
+    return json.dumps(healthschema.schema(), indent=1) + "\n"
+
+
 PAGES: Final[dict[str, Callable[[], str]]] = {
     "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
-    "methods/observations.md": observations_page,
+    "methods/observations.md": observations_page, "health.schema.json": health_schema,
 }  # fmt: skip
 
 

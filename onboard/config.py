@@ -170,6 +170,16 @@ class DownlinkConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class HealthConfig:
+    """Who else is told how it goes."""
+
+    prometheus: str | None = option(
+        None,
+        "text file for Prometheus' node exporter, written each second, such as /run/swathd/swathd.prom; null: there is none",
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class SwathdConfig:
     """Everything `swathd run` needs to know."""
 
@@ -184,6 +194,7 @@ class SwathdConfig:
     )
     recorder: RecorderConfig = option(RecorderConfig, "flight logs")
     downlink: DownlinkConfig = option(DownlinkConfig, "live view on the ground")
+    health: HealthConfig = option(HealthConfig, "how it goes, for monitors")
     mount: str | None = option(
         None, "mount file that goes into every log, relative to this file; null: the nominal mount"
     )

@@ -18,7 +18,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mount import Mount, load_mount
 from flightlog.records import ClockSync, HostClock
-from onboard import announce, health, leftovers, logfolder, notify
+from onboard import announce, health, leftovers, logfolder, metrics, notify
 from onboard.announce import Announcer
 from onboard.autopilot import Link
 from onboard.config import SwathdConfig
@@ -105,8 +105,9 @@ class Daemon:
         self._boot_id = boot_id()
         self._directory = Path(settings.recorder.directory)
         self._status_path = settings.status_path(os.environ.get("RUNTIME_DIRECTORY"))
+        self._metrics_path = None if settings.health.prometheus is None else Path(settings.health.prometheus)
         self._stop = stop
-        self._status_trouble = False
+        self._unwritten: set[Path] = set()
         self._landing = Landing()
         self._links: dict[str, Link] = {}
         self._relay: Relay | None = None
@@ -294,14 +295,20 @@ class Daemon:
     # Status -------------------------------------------------------------------------------------------------------
 
     def _write_status(self, status: Status) -> None:
-        try:
-            logfolder.write_atomically(self._status_path, health.to_json(status), sync=False)
-        except OSError as error:
-            if not self._status_trouble:
-                _log.error("status file %s cannot be written (%s)", self._status_path, error.strerror)
-            self._status_trouble = True
-        else:
-            self._status_trouble = False
+        texts = {self._status_path: health.to_json(status)}
+        if self._metrics_path is not None:
+            verdict = health.judge(status, status.time_ns, self._boot_id)
+            armed = health.armed(status, status.time_ns, self._boot_id)
+            texts[self._metrics_path] = metrics.text(status, verdict, armed)
+        for path, text in texts.items():
+            try:
+                logfolder.write_atomically(path, text, sync=False)
+            except OSError as error:
+                if path not in self._unwritten:
+                    _log.error("%s cannot be written (%s)", path, error.strerror)
+                self._unwritten.add(path)
+            else:
+                self._unwritten.discard(path)
 
     def _status(self) -> Status:
         now = read_clocks()

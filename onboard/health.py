@@ -20,6 +20,10 @@ STALLED_NS: Final = 5 * NS_PER_S
 """A worker without progress for this long hangs; a slow card may well hold the recorder for a second or two."""
 
 
+SCHEMA: Final = 1
+"""Of what `swathd health --json` prints (docs/health.schema.json): fields may come, and none goes or changes without another number."""
+
+
 class Level(IntEnum):
     """Exit code of `swathd health`, as monitoring plug-ins have it."""
 
@@ -237,6 +241,17 @@ def judge(status: Status, now_ns: int, boot_id: str) -> Verdict:
     if status.downlink is not None and status.downlink.trouble:
         found.append((Level.WARNING, f"downlink: {status.downlink.trouble}; recording goes on"))
     return Verdict(max((level for level, _ in found), default=Level.GOOD), [text for _, text in found])
+
+
+def told(verdict: "Verdict", is_armed: bool | None, status: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What `swathd health --json` prints; `status` is the tree of a status file, None where there is none."""
+    return {
+        "schema": SCHEMA,
+        "verdict": verdict.level.name,
+        "findings": verdict.findings,
+        "armed": is_armed,
+        "status": status,
+    }
 
 
 def armed(status: Status, now_ns: int, boot_id: str) -> bool | None:

@@ -73,7 +73,9 @@ def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
         # an unknown state counts as critical, and a monitor reads the exit code
         reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
         if as_json:
-            return Level.CRITICAL, json.dumps({"verdict": Level.CRITICAL.name, "findings": [reason]}, indent=1)
+            return Level.CRITICAL, json.dumps(
+                health.told(health.Verdict(Level.CRITICAL, [reason]), None, None), indent=1
+            )
         return Level.CRITICAL, clean(f"{Level.CRITICAL.name}: {reason}")
     boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     now_ns = time.monotonic_ns()
@@ -83,10 +85,5 @@ def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
         verdict = health.Verdict(Level.CRITICAL, [ended, *verdict.findings])
     if not as_json:
         return verdict.level, "\n".join(map(clean, health.report(status, verdict)))
-    tree = {
-        "verdict": verdict.level.name,
-        "findings": verdict.findings,
-        "armed": health.armed(status, now_ns, boot_id),
-        "status": json.loads(content),
-    }
-    return verdict.level, json.dumps(tree, indent=1)
+    is_armed = health.armed(status, now_ns, boot_id)
+    return verdict.level, json.dumps(health.told(verdict, is_armed, json.loads(content)), indent=1)

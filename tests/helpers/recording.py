@@ -89,6 +89,7 @@ def recording(folder: Path, logs: Path, *, lidar: bool, **recorder: Any) -> Iter
         "ins": {"device": f"udp:127.0.0.1:{mavlink_port}"},
         "recorder": {"directory": str(logs), "segment_s": 1, "min_free_mb": 8, **recorder},
         "status_file": str(folder / "status.json"),
+        "health": {"prometheus": str(folder / "swathd.prom")},
     }
     config = folder / "swathd.yaml"
     config.write_text(json.dumps(settings))
