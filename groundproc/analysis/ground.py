@@ -6,7 +6,7 @@ points, and some 200 MB for a block.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -16,16 +16,13 @@ import numpy.typing as npt
 import shapely
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from flightlog.errors import CoverageError
 from groundproc.analysis.terrain.building import outlines, roofs
-from groundproc.analysis.terrain.filter import bare_ground, smoothed
+from groundproc.analysis.terrain.floor import FILL_M, GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED, Floor
 from groundproc.analysis.terrain.holdout import HoldOut
-from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
-from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, Settings, settings_for
+from groundproc.analysis.terrain.settings import Settings, settings_for
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.analysis.terrain.water import read_water
 from groundproc.cloud import reader
-from groundproc.cloud.metres import Metres, metres_of
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -39,30 +36,23 @@ from groundproc.vectors.features import Features, write_features
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
-UNCLASSIFIED, GROUND, LOW, MEDIUM, HIGH, BUILDING, LOW_NOISE, WATER, HIGH_NOISE = 1, 2, 3, 4, 5, 6, 7, 9, 18
-"""Classes of LAS 1.4 R15, table 17."""
+LOW, MEDIUM, HIGH, BUILDING, WATER = 3, 4, 5, 6, 9
+"""Classes of LAS 1.4 R15, table 17, beside those of the floor."""
 NAMES: Final = {
     GROUND: "ground", LOW: "low vegetation", MEDIUM: "medium vegetation", HIGH: "high vegetation", BUILDING: "building",
     LOW_NOISE: "low noise", WATER: "water", HIGH_NOISE: "high noise",
 }  # fmt: skip
 _LOW_M, _MEDIUM_M = 0.5, 2.0
 """Tops of low and of medium vegetation."""
-_NOISE_HEIGHT_M: Final = 3.0
-"""Lower than this above ground nothing is called high noise."""
-_LEAST_DEPTH_M: Final = 0.5
-"""Points are low noise that lie so far below the ground, and beyond its own tolerance."""
 _GRASS_M: Final = 0.1
 """Ground for the terrain model is no higher above the lowest points than their scatter and this ..."""
 _GRASS_SHARE: Final = 0.3
 """... and this share of what slope adds to the tolerance of the class: grass belongs to the class, but shall not lift the model."""
-_BASE_CELLS: Final = 1.5
 _REACH_M: Final = 5.0
 """Models end so far from the nearest point."""
 _SPIKE_M: Final = 1.0
 """A cell of a crown that lies so much lower than those around it was looked into by chance."""
 _SPIKE_RADIUS_M: Final = 1.0
-_FILL_M: Final = 60.0
-"""Halo of a block within which gaps are filled alike from both sides of its edge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,80 +111,26 @@ class Made:
 
 
 class _Area:
-    """Rasters of one cloud, from the first look at it to its models."""
+    """Rasters of one cloud above its floor: terrain, its sigma, canopy and roofs."""
 
-    def __init__(self, task: Task, cloud: reader.Cloud, metres: Metres, progress: Progress) -> None:
-        self.task, self.cloud, self.metres, self.progress = task, cloud, metres, progress
-        self.folder = task.output.parent
-        lowest = Cells(FINE_M if task.cell_m is None else task.cell_m, {"min", "count"})
-        lonely = Lonely()
-        for _, xyz, noise in self.pieces():
-            lowest.add(xyz[~noise], xyz[~noise, 2])
-            lonely.add(xyz)
-        fine = lowest.grid()
-        if fine is None:
-            raise CoverageError(f"{cloud.path}: all its points are classed as noise")
-        density = _density(lowest, fine)
-        self.settings = settings_for(task.terrain, density, task.cell_m, task.window_m)
-        self.made = Made(self.settings, density)
-        side_m = 4.0 / np.sqrt(density)
-        self.lonely = lonely
-        if side_m > LEAST_SIDE_M:  # of a sparse cloud most points are further than that from each other
-            self.lonely = Lonely(side_m)
-            for _, xyz, _ in self.pieces():
-                self.lonely.add(xyz)
-        self._find(lowest, fine)
-
-    def pieces(self) -> Iterator[tuple[Any, Array, npt.NDArray[np.bool_]]]:
-        """Records, their places in metres, and which were noise already."""
-        for chunk in reader.chunks(self.cloud, columns=("classification",)):
-            kind = chunk.points.columns.get("classification")
-            xyz = np.ascontiguousarray(self.metres.of(chunk.points.xyz_m))
-            none = np.zeros(len(xyz), np.bool_)
-            yield chunk.record, xyz, none if kind is None else (kind == LOW_NOISE) | (kind == HIGH_NOISE)
-            self.progress(len(xyz))
-
-    def _find(self, lowest: Cells, fine: Grid) -> None:
-        """The ground of the lowest points."""
-        settings = self.settings
-        times = round(settings.cell_m / lowest.cell_m)
-        self.grid = _coarser(fine, times, settings.cell_m)
-        self.height, self.reach = Sheet(self.grid, self.folder), Sheet(self.grid, self.folder)
-        self.base = Sheet(self.grid, self.folder)
-        halo = round((2.0 * settings.window_m + 4.0 * settings.smoothing_m + _FILL_M) / settings.cell_m)
-        for block, around, cut in blocks(self.grid, halo):
-            values = _least(lowest, around, times)
-            if np.isfinite(cut(values)).any():
-                bare = bare_ground(values, settings)
-                self.height.put(block, cut(bare.height_m))
-                self.reach.put(block, cut(bare.reach_m))
-                self.base.put(block, cut(smoothed(bare.height_m, _BASE_CELLS)))
-
-    def heights(self, xyz: Array, noise: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
-        """Height above the lowest ground, and class as far as height tells it: ground, noise, or something above the ground."""
-        above = (xyz[:, 2] - bilinear(self.height.values, self.grid, xyz)).astype(np.float32)
-        reach = bilinear(self.reach.values, self.grid, xyz)
-        kind = np.full(len(xyz), UNCLASSIFIED, np.uint8)
-        kind[np.abs(above) <= reach] = GROUND
-        kind[above < -np.maximum(reach, _LEAST_DEPTH_M)] = LOW_NOISE
-        high = np.flatnonzero(above > _NOISE_HEIGHT_M)
-        kind[high[self.lonely.alone(xyz[high])]] = HIGH_NOISE
-        kind[noise & (above < 0.0)], kind[noise & (above >= 0.0)] = LOW_NOISE, HIGH_NOISE
-        return above, kind
+    def __init__(self, task: Task, floor: Floor) -> None:
+        self.task, self.floor = task, floor
+        self.grid, self.settings, self.folder = floor.grid, floor.settings, task.output.parent
+        self.made = Made(floor.settings, floor.density_m2)
 
     def survey(self) -> None:
         """Mean heights of the ground, and tops of all."""
         ground, top = Cells(self.settings.cell_m, {"mean", "sigma", "count"}), Cells(self.settings.cell_m, {"max"})
         grass_m: float | None = None
-        for _, xyz, noise in self.pieces():
-            above, kind = self.heights(xyz, noise)
+        for _, xyz, noise in self.floor.pieces():
+            above, kind = self.floor.heights(xyz, noise)
             bare = kind == GROUND
             if grass_m is None:
                 grass_m = _scatter(above[bare]) if bare.any() else None
-            slack = bilinear(self.reach.values, self.grid, xyz) - self.settings.height_m
+            slack = bilinear(self.floor.reach.values, self.grid, xyz) - self.settings.height_m
             bare &= above < (grass_m or 0.0) + slack * _GRASS_SHARE
             # above a surface so smooth that its mean within a cell is its value in the middle: slopes do no harm
-            ground.add(xyz[bare], xyz[bare, 2] - bilinear(self.base.values, self.grid, xyz[bare]))
+            ground.add(xyz[bare], xyz[bare, 2] - bilinear(self.floor.base.values, self.grid, xyz[bare]))
             seen = (kind != LOW_NOISE) & (kind != HIGH_NOISE)
             top.add(xyz[seen], xyz[seen, 2])
         self._model(ground, top)
@@ -205,10 +141,10 @@ class _Area:
         self.terrain, self.sigma = Sheet(self.grid, folder), Sheet(self.grid, folder)
         self.canopy, self.roof = Sheet(self.grid, folder), Sheet(self.grid, folder, np.uint8)
         self.seen = Sheet(self.grid, folder, np.uint8)
-        water = None if self.task.water is None else read_water(self.task.water, self.cloud, self.metres)
-        halo = round(_FILL_M / cell_m)
+        water = None if self.task.water is None else read_water(self.task.water, self.floor.cloud, self.floor.metres)
+        halo = round(FILL_M / cell_m)
         for number, (block, around, cut) in enumerate(blocks(self.grid, halo)):
-            base = self.base.window(around)
+            base = self.floor.base.window(around)
             if not np.isfinite(cut(base)).any():
                 continue
             residual = ground.window(around, "mean")
@@ -245,7 +181,7 @@ class _Area:
 
     def classes(self, xyz: Array, noise: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
         """Height above the terrain, and class."""
-        _, kind = self.heights(xyz, noise)
+        _, kind = self.floor.heights(xyz, noise)
         hag = (xyz[:, 2] - bilinear(self.terrain.values, self.grid, xyz)).astype(np.float32)
         other = kind == UNCLASSIFIED
         grid = self.grid
@@ -271,12 +207,12 @@ def work(task: Task, progress: Progress) -> Made:
     settings_for(task.terrain, 1.0, task.cell_m, task.window_m)  # before anything is read
     cloud = reader.look(task.cloud)
     with written_aside(task.output) as aside:
-        area = _Area(task, cloud, metres_of(cloud), progress)
+        area = _Area(task, Floor(cloud, task.output.parent, progress, task.terrain, task.cell_m, task.window_m))
         area.survey()
         _write_models(area)
         compressed = task.output.suffix.lower() != ".las"
         with Rewriter(cloud, aside, compressed, ("classification", "hag")) as out:
-            for record, xyz, noise in area.pieces():
+            for record, xyz, noise in area.floor.pieces():
                 hag, kind = area.classes(xyz, noise)
                 area.made.classes.update(dict(zip(*_counted(kind), strict=True)))
                 out.write(record, columns={"classification": kind, "hag": hag})
@@ -289,7 +225,7 @@ def work(task: Task, progress: Progress) -> Made:
 
 def _write_models(area: _Area) -> None:
     """The rasters and outlines that were asked for."""
-    task, metres, crs = area.task, area.metres, area.cloud.crs
+    task, metres, crs = area.task, area.floor.metres, area.floor.cloud.crs
     grid = Grid.of_window(area.grid, area.grid.cell_m / metres.across)
 
     def block(sheet: Callable[[Window], npt.NDArray[Any]]) -> Callable[[Window], npt.NDArray[Any]]:
@@ -309,7 +245,7 @@ def _write_models(area: _Area) -> None:
         heights = [_height_within(area, each) for each in found]
         shapes = [shapely.transform(each, lambda xy: xy / metres.across) for each in found]
         columns = {"area_m2": np.array([each.area for each in found]), "height_m": np.array(heights)}
-        features = Features(np.array(shapes, object), columns, area.cloud.horizontal)
+        features = Features(np.array(shapes, object), columns, area.floor.cloud.horizontal)
         with written_aside(task.buildings) as aside:
             write_features(aside, features, "Polygon", "buildings", task.buildings.suffix)
 
@@ -366,33 +302,3 @@ def _of_mean(ground: Cells, window: Window) -> npt.NDArray[Any]:
     sigma, count = ground.window(window, "sigma"), ground.window(window, "count")
     typical = np.nanmedian(sigma) if np.isfinite(sigma).any() else np.float32(0.1)
     return np.asarray(np.where(np.isfinite(sigma), np.maximum(sigma, 0.003), typical) / np.sqrt(np.maximum(count, 1.0)))
-
-
-def _density(cells: Cells, grid: Grid) -> float:
-    """Points in a square metre, of the square metres that have any."""
-    times = max(round(COARSE_M / cells.cell_m), 1)
-    points, seen = 0.0, 0
-    for block, _, _ in blocks(_coarser(grid, times, cells.cell_m * times), 0):
-        count = cells.window(_finer(block, times), "count").astype(np.float64)
-        count = count.reshape(block.rows, times, block.columns, times).sum(axis=(1, 3))
-        points, seen = points + float(count.sum()), seen + int((count > 0).sum())
-    return points / seen / (cells.cell_m * times) ** 2
-
-
-def _least(cells: Cells, window: Window, times: int) -> npt.NDArray[np.float32]:
-    """Lowest points of cells that are made of several smaller ones."""
-    if times == 1:
-        return cells.window(window, "min")
-    values = cells.window(_finer(window, times), "min").reshape(window.rows, times, window.columns, times)
-    low = np.where(np.isfinite(values), values, np.float32(np.inf)).min(axis=(1, 3))
-    return np.where(np.isfinite(low), low, np.float32(np.nan))
-
-
-def _coarser(grid: Window, times: int, cell_m: float) -> Grid:
-    column, row = grid.column // times, grid.row // times
-    columns, rows = -(-(grid.column + grid.columns) // times) - column, -(-(grid.row + grid.rows) // times) - row
-    return Grid(column, row, columns, rows, cell_m)
-
-
-def _finer(window: Window, times: int) -> Window:
-    return Window(window.column * times, window.row * times, window.columns * times, window.rows * times)

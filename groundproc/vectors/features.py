@@ -1,5 +1,6 @@
 """Features in GeoPackage and GeoJSON: geometries with attributes, in a CRS that the file states."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,12 +117,14 @@ def write_features(path: Path, features: Features, kind: str, layer: str, ending
     names = list(features.columns)
     named = path.with_name(f"{path.name}{suffix}")  # GDAL looks at the ending too
     try:
-        pyogrio.raw.write(
-            named, shapely.to_wkb(features.geometry, output_dimension=3 if kind.endswith(" Z") else 2),
-            [_storable(features.columns[name]) for name in names], names,
-            layer=layer, driver=DRIVERS[suffix], geometry_type=kind,
-            crs=None if features.crs is None else features.crs.to_wkt(),
-        )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)  # not known is not known
+            pyogrio.raw.write(
+                named, shapely.to_wkb(features.geometry, output_dimension=3 if kind.endswith(" Z") else 2),
+                [_storable(features.columns[name]) for name in names], names,
+                layer=layer, driver=DRIVERS[suffix], geometry_type=kind,
+                crs=None if features.crs is None else features.crs.to_wkt(),
+            )  # fmt: skip
         named.replace(path)
     except (*_DAMAGE, OSError) as error:
         raise SourceError(f"{path}: cannot be written ({' '.join(str(error).split())})") from None

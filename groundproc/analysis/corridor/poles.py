@@ -1,0 +1,125 @@
+"""Upright things: poles and masts."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+Array = npt.NDArray[np.float64]
+
+MAST_M: Final = 15.0
+"""Higher poles are called masts."""
+HALO_M: Final = 2.0
+_LEAST_M: Final = 3.0
+_CELL_M: Final = 0.5
+_BIN_M: Final = 0.5
+_FEWEST_BINS: Final = 4
+_FILLED: Final = 0.65
+"""Share of its height that has points."""
+_CORE_M: Final = 0.35
+_RING_M: Final = (0.6, 1.6)
+_RING: Final = 0.35
+"""Points around a pole, as a share of its own at the same heights: a crown has many times as many as its stem."""
+_CROWN: Final = 2.5
+"""The same near its top, where crossarms and wires are."""
+_FOOT_M: Final = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Pole:
+    """A pole or a mast.
+
+    Attributes
+    ----------
+    x, y, foot_m : float
+        Of the ground under it.
+    height_m : float
+    score : float
+        Share of its height that has points, less what is around it.
+    """
+
+    x: float
+    y: float
+    foot_m: float
+    height_m: float
+    score: float
+
+    @property
+    def kind(self) -> str:
+        """By height."""
+        return "mast" if self.height_m >= MAST_M else "pole"
+
+
+def upright(xyz_m: Array, above_m: npt.NDArray[np.float32], core: npt.NDArray[np.bool_]) -> list[Pole]:
+    """Poles among the points of a tile.
+
+    Parameters
+    ----------
+    xyz_m : ndarray, shape (n, 3)
+        Above the ground.
+    above_m : ndarray, shape (n,)
+        Their heights above it.
+    core : ndarray of bool, shape (n,)
+        Points of the tile proper: a pole is the tile's that the nearest to its axis is in.
+    """
+    some = above_m > _FOOT_M
+    xyz_m, above_m, core = xyz_m[some], above_m[some], core[some]
+    if not len(xyz_m):
+        return []
+    tree = cKDTree(xyz_m[:, :2])
+    found: list[Pole] = []
+    for middle in _columns(xyz_m, above_m):
+        if any(np.hypot(middle[0] - p.x, middle[1] - p.y) < 1.0 for p in found):
+            continue
+        near = np.array(tree.query_ball_point(middle, _RING_M[1]))
+        pole = _pole(middle, xyz_m[near], above_m[near])
+        if pole is None or any(np.hypot(pole.x - p.x, pole.y - p.y) < 1.0 for p in found):
+            continue
+        if core[tree.query([pole.x, pole.y])[1]]:
+            found.append(pole)
+    return found
+
+
+def _columns(xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Array:
+    """Middles of cells with points at many heights, the fullest first, shape (m, 2)."""
+    cell = np.floor(xyz_m[:, :2] / _CELL_M).astype(np.int64)
+    cell -= cell.min(axis=0)
+    level = np.floor(above_m / _BIN_M).astype(np.int64).clip(0, 255)
+    key = (cell[:, 0] << 36) | (cell[:, 1] << 8) | level
+    column, counts = np.unique(np.unique(key) >> 8, return_counts=True)
+    full = column[counts >= _FEWEST_BINS]
+    number = np.searchsorted(full, key >> 8).clip(0, max(len(full) - 1, 0))
+    inside = np.flatnonzero(full[number] == key >> 8) if len(full) else np.empty(0, np.int64)
+    if not len(inside):
+        return np.empty((0, 2))
+    number = number[inside]
+    total = np.bincount(number)
+    middles = np.stack([np.bincount(number, xyz_m[inside, axis]) / total for axis in (0, 1)], axis=1)
+    return middles[np.argsort(-counts[counts >= _FEWEST_BINS], kind="stable")]
+
+
+def _pole(middle: Array, xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Pole | None:
+    """The pole near a place, if there is one."""
+    for _ in range(3):
+        inside = np.hypot(*(xyz_m[:, :2] - middle).T) < _CORE_M
+        if inside.sum() < _FEWEST_BINS:
+            return None
+        middle = np.median(xyz_m[inside, :2], axis=0)
+    away = np.hypot(*(xyz_m[:, :2] - middle).T)
+    inside = away < _CORE_M
+    levels = np.unique(np.floor(above_m[inside] / _BIN_M).astype(np.int64))
+    top = float(above_m[inside].max())
+    if top < _LEAST_M:
+        return None
+    filled = len(levels) / (np.floor(top / _BIN_M) - np.floor(_FOOT_M / _BIN_M) + 1.0)
+    # crossarms and wires are near its top, bushes near its foot
+    body, head = (above_m > 1.5) & (above_m < 0.75 * top), above_m >= 0.75 * top
+    ring = (away > _RING_M[0]) & (away < _RING_M[1])
+    share = int((body & ring).sum()) / max(int((body & inside).sum()), 1)
+    crown = int((head & ring).sum()) / max(int((head & inside).sum()), 1)
+    if filled < _FILLED or share > _RING or crown > _CROWN:
+        return None
+    foot = float(np.median(xyz_m[inside, 2] - above_m[inside]))
+    return Pole(float(middle[0]), float(middle[1]), foot, top, float(filled * (1.0 - share)))

@@ -1,0 +1,196 @@
+"""Conductors from attachment to attachment, of chains of points."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.analysis.corridor.catenary import Catenary, fitted
+from groundproc.analysis.corridor.poles import Pole
+
+Array = npt.NDArray[np.float64]
+
+FEWEST: Final = 10
+"""Points of a conductor."""
+SHORTEST_M: Final = 10.0
+_LEAST_PIECE: Final = 6
+_LEAST_PIECE_M: Final = 5.0
+_ROUGH_M: Final = 0.08
+"""A chain that deviates by more from one curve may be of two spans ..."""
+_BETTER: Final = 3.0
+"""... and is, if two curves leave so much less of its squares."""
+_TRIALS: Final = 40
+_DRAWS: Final = 300
+_DRAW_M: Final = 30.0
+_ON_M: Final = 0.25
+_WORST_M: Final = 0.15
+_JOIN_M: Final = 40.0
+"""Gap that a conductor may have."""
+_COVERED: Final = 0.5
+_BIN_M: Final = 5.0
+_ARM_M: Final = 2.6
+"""Half a crossarm, and more."""
+
+
+def conductors(chains: Sequence[Array], poles: Sequence[Pole]) -> list[Catenary]:
+    """Wires, one for each conductor and span.
+
+    Parameters
+    ----------
+    chains : sequence of ndarray, shape (n, 3)
+    poles : sequence of Pole
+    """
+    pieces = [part for chain in chains for part in cut(chain)]
+    whole = joined(pieces)
+    wires = [wire for wire, points in zip(map(fitted, whole), whole, strict=True) if _sound(wire, points)]
+    return [attached(each, wires, poles) for each in wires]
+
+
+def cut(points_m: Array, depth: int = 0) -> list[Array]:
+    """A chain in pieces that are one curve each: at a support the curve has a kink, and there two conductors may be joined."""
+    if len(points_m) < _LEAST_PIECE:
+        return []
+    whole = fitted(points_m)
+    if depth > 30 or whole.rms_m < _ROUGH_M or whole.length_m < 2.0 * _LEAST_PIECE_M:
+        return [points_m]
+    s, _, _ = whole.local(points_m)
+    order = np.argsort(s)
+    points_m, s = points_m[order], s[order]
+    place, best = _kink(points_m, s)
+    if place and best * _BETTER < _misfit(points_m):
+        return cut(points_m[:place], depth + 1) + cut(points_m[place:], depth + 1)
+    on = _one_of(points_m)
+    if _LEAST_PIECE <= on.sum() < len(points_m):
+        return cut(points_m[on], depth + 1) + cut(points_m[~on], depth + 1)
+    return [points_m]
+
+
+def _kink(points_m: Array, s: Array) -> tuple[int, float]:
+    """Where two curves fit points in order along them best, as the number of the first of the second, and what squares are left then."""
+    best, place = np.inf, 0
+    for at in np.linspace(s[0] + _LEAST_PIECE_M, s[-1] - _LEAST_PIECE_M, _TRIALS):
+        k = int(np.searchsorted(s, at))
+        if _LEAST_PIECE <= k <= len(s) - _LEAST_PIECE:
+            cost = _misfit(points_m[:k]) + _misfit(points_m[k:])
+            if cost < best:
+                best, place = cost, k
+    return place, best
+
+
+def _one_of(points_m: Array) -> npt.NDArray[np.bool_]:
+    """Points of the one curve that most of a bundle are on (RANSAC, always by the same chances)."""
+    rng = np.random.default_rng(len(points_m))
+    best = np.zeros(len(points_m), np.bool_)
+    for _ in range(_DRAWS):
+        start = int(rng.integers(len(points_m)))
+        near = np.flatnonzero(np.hypot(*(points_m[:, :2] - points_m[start, :2]).T) < _DRAW_M)
+        three = points_m[rng.choice(near, 3)]
+        d = three[2, :2] - three[0, :2]
+        length = float(np.hypot(*d))
+        if length < _LEAST_PIECE_M:
+            continue
+        d /= length
+        u = (three[:, :2] - three[0, :2]) @ d
+        if np.diff(np.sort(u)).min() < 1.0:
+            continue
+        bend = np.polyfit(u, three[:, 2], 2)
+        v = points_m[:, :2] - three[0, :2]
+        off, up = v @ np.array([-d[1], d[0]]), points_m[:, 2] - np.polyval(bend, v @ d)
+        on = (np.abs(off) < _ON_M) & (np.abs(up) < _ON_M)
+        if bend[0] > -1e-3 and on.sum() > best.sum():
+            best = on
+    return best
+
+
+def _misfit(points_m: Array) -> float:
+    """Sum of squares off a line in plan and a parabola above it, large ones counted less."""
+    middle = points_m.mean(axis=0)
+    d = points_m - middle
+    _, vectors = np.linalg.eigh(d[:, :2].T @ d[:, :2])
+    s, off = d[:, :2] @ vectors[:, 1], d[:, :2] @ vectors[:, 0]
+    design = np.stack([np.ones_like(s), s, s * s], axis=1)
+    up = d[:, 2] - design @ np.linalg.lstsq(design, d[:, 2], rcond=None)[0]
+    return float(np.minimum(off**2 + up**2, 0.25).sum())
+
+
+def joined(pieces: Sequence[Array]) -> list[Array]:
+    """Pieces of one conductor put together, where no point was met for some metres between them."""
+    left = sorted((each for each in pieces if len(each) >= _LEAST_PIECE), key=len, reverse=True)
+    curves = [fitted(each) for each in left]
+    out = []
+    while left:
+        points, curve = left.pop(0), curves.pop(0)
+        n = 0
+        while n < len(left):
+            both = _together(points, curve, left[n], curves[n])
+            if both is None:
+                n += 1
+                continue
+            points = np.concatenate([points, left.pop(n)])
+            curves.pop(n)
+            curve, n = both, 0
+        out.append(points)
+    return out
+
+
+def _together(points: Array, curve: Catenary, others: Array, other: Catenary) -> Catenary | None:
+    """The one curve of two pieces, if they are of one."""
+    s, off, up = curve.local(others)
+    gap = max(s.min() - curve.end_m, curve.start_m - s.max())
+    if gap > _JOIN_M or gap < -1.0 - 0.1 * other.length_m:
+        return None
+    if np.median(np.abs(off)) > 0.4 + 0.01 * gap or np.median(np.abs(up)) > 0.6 + 0.04 * max(gap, 0.0):
+        return None
+    both = fitted(np.concatenate([points, others]))
+    return both if both.rms_m < 1.3 * max(curve.rms_m, other.rms_m, 0.04) else None
+
+
+def _sound(wire: Catenary, points_m: Array) -> bool:
+    """Long, thin and without a gap over most of its length."""
+    if len(points_m) < FEWEST or wire.length_m < SHORTEST_M or wire.rms_m > _WORST_M:
+        return False
+    s, _, _ = wire.local(points_m)
+    bins = np.unique(np.floor((s - wire.start_m) / _BIN_M))
+    slope = np.abs(np.diff(wire.height(np.array([wire.start_m, wire.end_m])))[0]) / wire.length_m
+    return bool(len(bins) >= _COVERED * wire.length_m / _BIN_M and slope < 1.0)
+
+
+def attached(wire: Catenary, wires: Sequence[Catenary], poles: Sequence[Pole]) -> Catenary:
+    """The wire as far as where it hangs: at a pole beside its end, or where the next span's curve meets its own."""
+    reach = 3.0 + 0.12 * wire.length_m
+    ends = []
+    for end, sign in ((wire.start_m, -1.0), (wire.end_m, 1.0)):
+        found = _at_pole(wire, end, reach, poles)
+        if found is None:
+            found = _at_wire(wire, end, sign, reach, wires)
+        ends.append(end if found is None else found)
+    return wire.between(min(ends[0], wire.middle_of - 1.0), max(ends[1], wire.middle_of + 1.0))
+
+
+def _at_pole(wire: Catenary, end: float, reach: float, poles: Sequence[Pole]) -> float | None:
+    best, found = reach, None
+    for pole in poles:
+        place = np.array([[pole.x, pole.y, pole.foot_m]])
+        s, off, up = wire.local(place)
+        high = -float(up[0])
+        if abs(off[0]) <= _ARM_M and abs(s[0] - end) < best and high < pole.height_m + 2.5:
+            best, found = abs(float(s[0]) - end), float(s[0])
+    return found
+
+
+def _at_wire(wire: Catenary, end: float, sign: float, reach: float, wires: Sequence[Catenary]) -> float | None:
+    here = np.append(wire.origin_m + end * wire.along, wire.height(np.array([end]))[0])
+    for other in wires:
+        if other is wire:
+            continue
+        tips = other.between(other.start_m, other.end_m).places(1e9)
+        if np.linalg.norm(tips - here, axis=1).min() > reach:
+            continue
+        s = end + sign * np.linspace(-0.1 * reach, reach, 201)
+        places = np.column_stack([wire.origin_m + s[:, None] * wire.along, wire.height(s)])
+        _, off, up = other.local(places)
+        apart = np.hypot(off, up)
+        if apart.min() < 0.3:
+            return float(s[np.argmin(apart)])
+    return None

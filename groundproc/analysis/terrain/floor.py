@@ -1,0 +1,156 @@
+"""The floor of a cloud: the ground by its lowest points, over which heights of all its points are told.
+
+One reading of the cloud, of a sparse one two; rasters lie in temporary files without a name.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.errors import CoverageError
+from groundproc.analysis.terrain.filter import bare_ground, smoothed
+from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
+from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, settings_for
+from groundproc.analysis.terrain.surfaces import Sheet, blocks
+from groundproc.cloud import reader
+from groundproc.cloud.metres import metres_of
+from groundproc.raster.cells import Cells
+from groundproc.raster.grid import Grid, Window
+from groundproc.raster.sampling import bilinear
+
+Array = npt.NDArray[np.float64]
+Progress = Callable[[int], object]
+
+UNCLASSIFIED, GROUND, LOW_NOISE, HIGH_NOISE = 1, 2, 7, 18
+"""Classes of LAS 1.4 R15, table 17."""
+NOISE_HEIGHT_M: Final = 3.0
+"""Lower than this above ground nothing is called high noise."""
+LEAST_DEPTH_M: Final = 0.5
+"""Points are low noise that lie so far below the ground, and beyond its own tolerance."""
+FILL_M: Final = 60.0
+"""Halo of a block within which gaps are filled alike from both sides of its edge."""
+_BASE_CELLS: Final = 1.5
+
+
+class Floor:
+    """The ground of a cloud.
+
+    Parameters
+    ----------
+    cloud : reader.Cloud
+    folder : Path
+        For temporary files.
+    progress : callable
+        Told of points done, also while `pieces` are taken.
+    terrain : str
+        See `settings.PRESETS`.
+    cell_m, window_m : float, optional
+
+    Attributes
+    ----------
+    height, reach : Sheet
+        Lowest ground, and how far from it points are ground.
+    base : Sheet
+        The same, smoothed.
+    """
+
+    def __init__(
+        self,
+        cloud: reader.Cloud,
+        folder: Path,
+        progress: Progress,
+        terrain: str = "auto",
+        cell_m: float | None = None,
+        window_m: float | None = None,
+    ) -> None:
+        self.cloud, self.metres, self.progress, self._folder = cloud, metres_of(cloud), progress, folder
+        lowest = Cells(FINE_M if cell_m is None else cell_m, {"min", "count"})
+        self._lonely = Lonely()
+        for _, xyz, noise in self.pieces():
+            lowest.add(xyz[~noise], xyz[~noise, 2])
+            self._lonely.add(xyz)
+        fine = lowest.grid()
+        if fine is None:
+            raise CoverageError(f"{cloud.path}: all its points are classed as noise")
+        self.density_m2 = _density(lowest, fine)
+        self.settings = settings_for(terrain, self.density_m2, cell_m, window_m)
+        side_m = 4.0 / np.sqrt(self.density_m2)
+        if side_m > LEAST_SIDE_M:  # of a sparse cloud most points are further than that from each other
+            self._lonely = Lonely(side_m)
+            for _, xyz, _ in self.pieces():
+                self._lonely.add(xyz)
+        self._find(lowest, fine)
+
+    def pieces(self) -> Iterator[tuple[Any, Array, npt.NDArray[np.bool_]]]:
+        """Records, their places in metres, and which were noise already."""
+        for chunk in reader.chunks(self.cloud, columns=("classification",)):
+            kind = chunk.points.columns.get("classification")
+            xyz = np.ascontiguousarray(self.metres.of(chunk.points.xyz_m))
+            none = np.zeros(len(xyz), np.bool_)
+            yield chunk.record, xyz, none if kind is None else (kind == LOW_NOISE) | (kind == HIGH_NOISE)
+            self.progress(len(xyz))
+
+    def _find(self, lowest: Cells, fine: Grid) -> None:
+        """The ground of the lowest points."""
+        settings = self.settings
+        times = round(settings.cell_m / lowest.cell_m)
+        self.grid = _coarser(fine, times, settings.cell_m)
+        self.height, self.reach = Sheet(self.grid, self._folder), Sheet(self.grid, self._folder)
+        self.base = Sheet(self.grid, self._folder)
+        halo = round((2.0 * settings.window_m + 4.0 * settings.smoothing_m + FILL_M) / settings.cell_m)
+        for block, around, cut in blocks(self.grid, halo):
+            values = _least(lowest, around, times)
+            if np.isfinite(cut(values)).any():
+                bare = bare_ground(values, settings)
+                self.height.put(block, cut(bare.height_m))
+                self.reach.put(block, cut(bare.reach_m))
+                self.base.put(block, cut(smoothed(bare.height_m, _BASE_CELLS)))
+
+    def above(self, xyz: Array) -> npt.NDArray[np.float32]:
+        """Height above the lowest ground, shape (n,)."""
+        return (xyz[:, 2] - bilinear(self.height.values, self.grid, xyz)).astype(np.float32)
+
+    def heights(self, xyz: Array, noise: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
+        """Height above the lowest ground, and class as far as height tells it: ground, noise, or something above the ground."""
+        above = self.above(xyz)
+        reach = bilinear(self.reach.values, self.grid, xyz)
+        kind = np.full(len(xyz), UNCLASSIFIED, np.uint8)
+        kind[np.abs(above) <= reach] = GROUND
+        kind[above < -np.maximum(reach, LEAST_DEPTH_M)] = LOW_NOISE
+        high = np.flatnonzero(above > NOISE_HEIGHT_M)
+        kind[high[self._lonely.alone(xyz[high])]] = HIGH_NOISE
+        kind[noise & (above < 0.0)], kind[noise & (above >= 0.0)] = LOW_NOISE, HIGH_NOISE
+        return above, kind
+
+
+def _density(cells: Cells, grid: Grid) -> float:
+    """Points in a square metre, of the square metres that have any."""
+    times = max(round(COARSE_M / cells.cell_m), 1)
+    points, seen = 0.0, 0
+    for block, _, _ in blocks(_coarser(grid, times, cells.cell_m * times), 0):
+        count = cells.window(_finer(block, times), "count").astype(np.float64)
+        count = count.reshape(block.rows, times, block.columns, times).sum(axis=(1, 3))
+        points, seen = points + float(count.sum()), seen + int((count > 0).sum())
+    return points / seen / (cells.cell_m * times) ** 2
+
+
+def _least(cells: Cells, window: Window, times: int) -> npt.NDArray[np.float32]:
+    """Lowest points of cells that are made of several smaller ones."""
+    if times == 1:
+        return cells.window(window, "min")
+    values = cells.window(_finer(window, times), "min").reshape(window.rows, times, window.columns, times)
+    low = np.where(np.isfinite(values), values, np.float32(np.inf)).min(axis=(1, 3))
+    return np.where(np.isfinite(low), low, np.float32(np.nan))
+
+
+def _coarser(grid: Window, times: int, cell_m: float) -> Grid:
+    column, row = grid.column // times, grid.row // times
+    columns, rows = -(-(grid.column + grid.columns) // times) - column, -(-(grid.row + grid.rows) // times) - row
+    return Grid(column, row, columns, rows, cell_m)
+
+
+def _finer(window: Window, times: int) -> Window:
+    return Window(window.column * times, window.row * times, window.columns * times, window.rows * times)

@@ -1,0 +1,70 @@
+"""`swath wires`: power lines of a cloud, with poles, masts, stays and fences, and how far everything is from a wire."""
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "find the wires of a cloud, and poles, masts, stays, fences: spans, sag, clearance"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
+    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="WIRES.geojson", help="lines, .geojson or .gpkg"
+    )
+    parser.add_argument(
+        "--clearance",
+        type=Path,
+        metavar="OUT.laz",
+        help="write the same points with their distance to the nearest wire, and classes",
+    )
+    parser.add_argument(
+        "--min-height",
+        type=float,
+        default=3.0,
+        metavar="M",
+        help="height above ground that wires hang at, at least [m]; default: 3",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
+    add_force(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Find them, and print a table."""
+    import math
+
+    from flightlog.errors import UsageError
+    from groundproc.analysis.wires import Task, work
+    from groundproc.commands.figures import claim_json, points_bar, warn, write_json
+    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
+    from groundproc.commands.outputs import claim_file
+    from groundproc.vectors.features import DRIVERS
+
+    expect([arguments.cloud], CLOUD, CLOUD_WORDS)
+    claim_file(arguments.output, tuple(DRIVERS), arguments.force, [arguments.cloud])
+    if arguments.clearance is not None:
+        claim_file(arguments.clearance, (".laz", ".las"), arguments.force, [arguments.cloud])
+    claim_json(arguments)
+    if not (math.isfinite(arguments.min_height) and arguments.min_height >= 1.0):
+        raise UsageError(f"--min-height {arguments.min_height:g} m: expected 1 m or more, for example 3")
+    with points_bar() as advance:
+        made = work(Task(arguments.cloud, arguments.output, arguments.clearance, arguments.min_height), advance)
+    figures = made.figures()
+    write_json(arguments, figures)
+    warn(made.warnings, sys.stderr)
+    if made.wires:
+        print(f"{'wire':<12}{'length [m]':>12}{'sag [m]':>10}{'to ground [m]':>15}{'to growth [m]':>15}")
+    for each in figures["wires"]:
+        near = [each["clearance_ground_m"], each["clearance_vegetation_m"]]
+        told = "".join(f"{'-' if value is None else format(value, '.2f'):>15}" for value in near)
+        print(
+            f"{each['kind']} {each['number']:<{11 - len(each['kind'])}}{each['length_m']:>12.2f}{each['sag_m']:>10.2f}{told}"
+        )
+    print(
+        f"{len(made.wires)} wires, {figures['poles']} poles, {figures['masts']} masts, {figures['stays']} stays, "
+        f"{figures['fences']} fences in {arguments.output}"
+    )
+    return 0
