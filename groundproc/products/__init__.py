@@ -38,7 +38,9 @@ class Entry:
 REGISTRY: Final[dict[str, Entry]] = {
     "cloud.laz": Entry("groundproc.products.cloud_laz", "CloudLaz", "all points, LAS 1.4 compressed"),
     "pictures": Entry(
-        "groundproc.products.pictures", "Pictures", "cloud_height.png, cloud_intensity.png: from above and from the south"
+        "groundproc.products.pictures",
+        "Pictures",
+        "cloud_height.png (as a lit surface), cloud_intensity.png: from above and from the south, to scale",
     ),
     "cloud.copc.laz": Entry("groundproc.products.cloud_copc", "CloudCopc", "the same points as an octree, for viewers"),
     "dsm.tif": Entry("groundproc.products.dsm", "Dsm", "surface model: the highest point of each cell, 0.25 m"),

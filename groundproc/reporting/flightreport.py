@@ -12,7 +12,7 @@ from groundproc.raster import geotiff
 from groundproc.reporting import cloudpart, maps, words
 from groundproc.reporting.charts import charts
 from groundproc.reporting.cloudpart import CloudPart
-from groundproc.reporting.markup import Html, section, tag
+from groundproc.reporting.markup import Html, joined, section, tag
 from groundproc.reporting.plots import draw
 from groundproc.trajectory.estimate import Estimate
 from groundproc.viewer.page import VIEWER, page, script_of
@@ -21,8 +21,11 @@ Array = npt.NDArray[np.float64]
 
 STYLES: Final = ("base.css", "viewer.css", "report.css")
 _DENSITY: Final = "density.tif"
-_CELLS: Final = 2000
-"""Along a side of the density that area and median are taken from."""
+_ROOM_BYTES: Final = 64
+"""For numbers of points that are longer than those of the page without them."""
+_CELL_M: Final = 1.0
+_MOST_CELLS: Final = 4000
+"""Along a side; of larger areas, cells are larger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,37 +61,50 @@ def compose(subject: Subject, most_points: int, most_bytes: int) -> str:
         A product that it shows is damaged.
     """
     part = cloudpart.read(subject.folder, most_points)
-    rest = len(_page(subject, part, "").encode())
-    if part is None:
-        return _page(subject, None, "")
-    text, part = cloudpart.fitted(part, most_bytes - rest - 64)
-    return _page(subject, part, text)
+    before, after = _before(subject, part), _after(subject, part)
+    rest = len(_page(subject, [before, _cloud(subject, part, ""), after]).encode())
+    text = ""
+    if part is not None:
+        text, part = cloudpart.fitted(part, most_bytes - rest - _ROOM_BYTES)
+    return _page(subject, [before, _cloud(subject, part, text), after])
 
 
-def _page(subject: Subject, part: CloudPart | None, text: str) -> str:
+def _page(subject: Subject, parts: Sequence[Html]) -> str:
+    title = f"Flight of {_day(subject.quality)}"
+    return page(title, STYLES, tag("main", parts), script_of((*VIEWER, "report.js")))
+
+
+def _before(subject: Subject, part: CloudPart | None) -> Html:
+    """What stands above the cloud."""
     quality = subject.quality
     names = ", ".join(log["file"] for log in quality["inputs"])
     density, area_m2 = _covered(subject, part)
-    parts = [
-        tag("header", tag("h1", f"Flight of {_day(quality)}"), tag("p", names)),
-        words.verdict(quality),
-        words.facts(quality, density, area_m2),
-        words.story(quality),
-        _cloud(subject, part, text),
-        _maps(subject, part),
-        section(
-            "quality",
-            "Quality over time",
-            tag("div", [draw(plot) for plot in charts(subject.estimate)], class_="plots"),
-        ),
-        words.clocks(quality),
-        words.control(quality),
-        words.losses(quality),
-        words.settings(quality["config"]),
-        words.provenance(quality, subject.digests),
-        tag("footer", "All figures are in quality.json beside this page."),
-    ]
-    return page(f"Flight of {_day(quality)}", STYLES, tag("main", parts), script_of((*VIEWER, "report.js")))
+    return joined(
+        [
+            tag("header", tag("h1", f"Flight of {_day(quality)}"), tag("p", names)),
+            words.verdict(quality),
+            words.facts(quality, density, area_m2),
+            words.story(quality),
+        ]
+    )
+
+
+def _after(subject: Subject, part: CloudPart | None) -> Html:
+    """What stands below it."""
+    quality = subject.quality
+    curves = tag("div", [draw(plot) for plot in charts(subject.estimate)], class_="plots")
+    return joined(
+        [
+            _maps(subject, part),
+            section("quality", "Quality over time", curves),
+            words.clocks(quality),
+            words.control(quality),
+            words.losses(quality),
+            words.settings(quality["config"]),
+            words.provenance(quality, subject.digests),
+            tag("footer", "All figures are in quality.json beside this page."),
+        ]
+    )
 
 
 def _day(quality: Mapping[str, Any]) -> str:
@@ -125,7 +141,8 @@ def _covered(subject: Subject, part: CloudPart | None) -> tuple[float | None, fl
     """Median density [points/m2] and area [m2] of what has points."""
     if _DENSITY in subject.digests and (subject.folder / _DENSITY).is_file():
         with geotiff.opened(subject.folder / _DENSITY) as raster:
-            values, cell_m = geotiff.coarse(raster, _CELLS)
+            side_m = max(raster.grid.columns, raster.grid.rows) * raster.grid.cell_m
+            values, cell_m = geotiff.coarse(raster, min(int(np.ceil(side_m / _CELL_M)), _MOST_CELLS))
         seen = values[values > 0.0]
         return (float(np.median(seen)), float(len(seen) * cell_m**2)) if len(seen) else (None, None)
     if part is None:

@@ -14,6 +14,8 @@ Whole = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 
 STEP_M: Final = 0.001
+_LEVEL: Final = 5
+"""Of deflate; 6 gains half a per cent."""
 _BITS: Final = 16
 """Of the curve's coordinates."""
 
@@ -31,7 +33,7 @@ def pack(local_m: npt.NDArray[np.float64], columns: Sequence[Bytes]) -> bytes:
         bytes_ = np.ascontiguousarray(zigzag[:, axis]).view(np.uint8).reshape(-1, 4)[:, :planes]
         parts.append(np.ascontiguousarray(bytes_.T).tobytes())
     parts += [column[order].tobytes() for column in columns]
-    return gzip.compress(b"".join(parts), 6, mtime=0)
+    return gzip.compress(b"".join(parts), _LEVEL, mtime=0)
 
 
 def along_curve(steps: Whole) -> Whole:

@@ -14,11 +14,14 @@ from groundproc.numerics.voxelhash import assign
 
 Array = npt.NDArray[np.float64]
 
-_READ: Final = 3
+_READ: Final = 2
 """Times as many points are looked at as are kept."""
 _CLOSE: Final = 0.97
 """Share of the wanted points that is enough."""
 _TRIALS: Final = 12
+_MORE: Final = 1_000
+"""Room for what a share of many nodes comes to beyond the share of all."""
+_TIME: Final = "time"
 _GOLDEN: Final = 0.6180339887498949
 
 
@@ -60,15 +63,21 @@ def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None) -> Thi
     CaptureError
         The cloud is damaged.
     """
-    parts = list((_of_octree if is_copc(cloud.path) else _of_file)(cloud, _READ * most, columns))
-    names = parts[0].columns
-    whole = Thinned(
-        np.concatenate([part.xyz_m for part in parts]),
-        {name: np.concatenate([part.columns[name] for part in parts]) for name in names},
-        np.concatenate([part.time_s for part in parts if part.time_s is not None]) if cloud.timed else None,
-        0.0,
-    )
-    return thinner(whole, most)
+    room = min(_READ * most, cloud.points)
+    held: dict[str, npt.NDArray[Any]] = {}
+    used = 0
+    # filled piece by piece: pieces and their sum together would be twice the memory
+    for part in (_of_octree if is_copc(cloud.path) else _of_file)(cloud, room, columns):
+        arrays = {"": part.xyz_m, **part.columns} | ({} if part.time_s is None else {_TIME: part.time_s})
+        count = min(len(part), room + _MORE - used)
+        for name, values in arrays.items():
+            if name not in held:
+                held[name] = np.empty((room + _MORE, *values.shape[1:]), values.dtype)
+            held[name][used : used + count] = values[:count]
+        used += count
+    whole = {name: values[:used] for name, values in held.items()}
+    time_s = whole.pop(_TIME, None)
+    return thinner(Thinned(whole.pop(""), whole, time_s, 0.0), most)
 
 
 def thinner(points: Thinned, most: int) -> Thinned:
