@@ -14,8 +14,8 @@ from groundproc.numerics.voxelhash import assign
 
 Array = npt.NDArray[np.float64]
 
-_READ: Final = 2
-"""Times as many points are looked at as are kept."""
+_READ: Final = (2, 4)
+"""Times as many points are looked at as are kept: of an octree, whose levels are even already, and of a file in the order of time."""
 _CLOSE: Final = 0.97
 """Share of the wanted points that is enough."""
 _TRIALS: Final = 12
@@ -63,11 +63,12 @@ def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None) -> Thi
     CaptureError
         The cloud is damaged.
     """
-    room = min(_READ * most, cloud.points)
+    octree = is_copc(cloud.path)
+    room = min(_READ[0 if octree else 1] * most, cloud.points)
     held: dict[str, npt.NDArray[Any]] = {}
     used = 0
     # filled piece by piece: pieces and their sum together would be twice the memory
-    for part in (_of_octree if is_copc(cloud.path) else _of_file)(cloud, room, columns):
+    for part in (_of_octree if octree else _of_file)(cloud, room, columns):
         arrays = {"": part.xyz_m, **part.columns} | ({} if part.time_s is None else {_TIME: part.time_s})
         count = min(len(part), room + _MORE - used)
         for name, values in arrays.items():
