@@ -34,7 +34,7 @@ frames, mount                 rotations; where lidar and antennas sit on the air
 hdl32e, mavlink, dataflash    the sensors' wire formats
 records, logfile              THE table of topics and their bytes; writer and reader of the log
 salvage                       a whole log out of a cut or damaged one
-vehicles, words               who the autopilot is on a link; text from outside, made harmless
+vehicles, signing, words      who the autopilot is on a link, and whether it is he; text from outside, made harmless
 container, mcapwriter, walk   the records of an MCAP file; writing them; reading past damage
 """
 

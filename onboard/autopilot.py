@@ -5,9 +5,11 @@ The link may come and go: it is reopened as often as needed, and the rest of the
 
 import logging
 import select
+import time
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -15,7 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from flightlog import records
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import SourceError
-from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser
+from flightlog.mavlink import AUTOPILOT_INVALID, Frame, FrameParser, decode, field_offset
+from flightlog.signing import Checker, Word, read_key, time_of
 from flightlog.vehicles import Sender, Vehicles
 from onboard.autopilotclock import AutopilotClock
 from onboard.config import LinkConfig, StreamsConfig
@@ -47,6 +50,12 @@ _STREAMS: Final = (
     ("extra3_hz", dialect.MAV_DATA_STREAM_EXTRA3, dialect.MAVLINK_MSG_ID_SYSTEM_TIME),
 )
 """Option, stream, and the message by which its rate is judged."""
+_ON_PX4: Final = {dialect.MAVLINK_MSG_ID_RAW_IMU: dialect.MAVLINK_MSG_ID_HIGHRES_IMU}
+"""What PX4 has in place of a message."""
+_BESIDE: Final = {dialect.MAVLINK_MSG_ID_GPS_RAW_INT: (dialect.MAVLINK_MSG_ID_SYS_STATUS,)}
+"""What else of a stream is asked for where each message is asked for by itself."""
+_VERSION_TRIES: Final = 3
+_AUTOPILOT_AT: Final = field_offset("HEARTBEAT", "autopilot")
 
 
 @dataclass(slots=True)
@@ -72,6 +81,12 @@ class LinkCounts:
     asked_hz: dict[str, int] = field(default_factory=dict)
     requests: int = 0
     """How many streams were asked for, or asked for again."""
+    kind: int = dialect.MAV_AUTOPILOT_GENERIC
+    """MAV_AUTOPILOT of the autopilot, as its heartbeat says."""
+    firmware: str = ""
+    """Its version, such as 4.5.7; empty: it has not said."""
+    signatures: dict[str, int] = field(default_factory=dict)
+    """Frames by what their signatures say, where there is a key."""
 
     @property
     def autopilot(self) -> tuple[int, int] | None:
@@ -125,7 +140,9 @@ class Link(Worker):
         self._topic = records.MAVLINK.topic + name
         self._chunks: list[Chunk] = []
         self._parser = FrameParser()
-        self._voice = Voice()
+        key = None if config.signing_key is None else read_key(Path(config.signing_key))
+        self._checker = None if key is None else Checker(key)
+        self._voice = Voice(key)
         self._requester = Requester(config.streams, self._voice)
         self.clock = AutopilotClock(name)
         self._outbox: deque[dialect.MAVLink_message] = deque(maxlen=_OUTBOX)
@@ -191,7 +208,7 @@ class Link(Worker):
         """Keep the chunks for the log, and examine the frames in them."""
         self._chunks += chunks
         for time_ns, data in chunks:
-            frames = self._parser.feed(time_ns, data)
+            frames = self._believed(self._parser.feed(time_ns, data))
             note_frames(self.counts, frames)
             for frame in frames:
                 if frame.known and (frame.system, frame.component) == self.counts.autopilot:
@@ -201,8 +218,19 @@ class Link(Worker):
         self.counts.bad_bytes = self._parser.bad_bytes
         self.counts.unknown_frames = self._parser.unknown
 
+    def _believed(self, frames: list[Frame]) -> list[Frame]:
+        """Those frames that nobody else can have sent; where there is no key, all."""
+        if self._checker is None:
+            return frames
+        good = [frame for frame in frames if frame.known and self._checker.check(frame) is Word.GOOD]
+        self.counts.signatures = {word.value: count for word, count in self._checker.counts.items()}
+        self._voice.sign_from(self._checker.newest + 1)
+        return good
+
     def _talk(self, source: Source, now_ns: int) -> None:
         """Send what is due."""
+        if self._checker is not None:
+            self._voice.sign_from(time_of(time.time_ns()))
         for data in self._requester.due(self.counts, now_ns):
             source.write(data)
         if self.counts.autopilot is None:
@@ -237,13 +265,11 @@ class Link(Worker):
         _log.info("link %s: %s is open", self.name, self._config.device)
 
 
-def streams_asked(streams: StreamsConfig) -> list[tuple[str, int, int]]:
-    """Name and id of the message by which each stream asked for is judged, and the rate asked for [Hz]."""
-    return [
-        (dialect.mavlink_map[message].msgname, message, rate)
-        for option, _, message in _STREAMS
-        if (rate := getattr(streams, option))
-    ]
+def streams_asked(streams: StreamsConfig, kind: int) -> list[tuple[str, int, int]]:
+    """Name and id of the message by which each stream asked for of a MAV_AUTOPILOT is judged, and the rate asked for [Hz]."""
+    others = _ON_PX4 if kind == dialect.MAV_AUTOPILOT_PX4 else {}
+    asked = [(others.get(message, message), getattr(streams, option)) for option, _, message in _STREAMS]
+    return [(dialect.mavlink_map[message].msgname, message, rate) for message, rate in asked if rate]
 
 
 def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
@@ -256,6 +282,16 @@ def note_frames(counts: LinkCounts, frames: list[Frame]) -> None:
             _tell_autopilot(counts)
         if (frame.system, frame.component) == counts.autopilot:
             counts.messages[frame.message_id] += 1
+            _note_kind(counts, frame)
+
+
+def _note_kind(counts: LinkCounts, frame: Frame) -> None:
+    """What the autopilot says of itself."""
+    if frame.message_id == dialect.MAVLINK_MSG_ID_HEARTBEAT and _AUTOPILOT_AT is not None:
+        counts.kind = frame.payload.ljust(9, b"\x00")[_AUTOPILOT_AT]
+    elif frame.message_id == dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION and (said := decode(frame)) is not None:
+        major, minor, patch, _ = int(said.flight_sw_version).to_bytes(4, "big")
+        counts.firmware = f"{major}.{minor}.{patch}"
 
 
 def _tell_autopilot(counts: LinkCounts) -> None:
@@ -287,6 +323,8 @@ class Requester:
         self._heartbeat_ns = 0
         self._checked_ns: int | None = None
         self._before: Counter[int] = Counter()
+        self._tries: Counter[int] = Counter()
+        self._version_tries = 0
 
     def due(self, counts: LinkCounts, now_ns: int) -> list[bytes]:
         """Frames to send now; `now_ns` is log time."""
@@ -296,22 +334,50 @@ class Requester:
         heartbeat = dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_ONBOARD_CONTROLLER, AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
         )
-        messages = [heartbeat, *self._requests(counts, counts.autopilot, now_ns)]
+        messages = [heartbeat, *self._version_request(counts, counts.autopilot)]
+        messages += self._requests(counts, counts.autopilot, now_ns)
         return [self._voice.frame(message, counts.autopilot[0], counts.version) for message in messages]
 
+    def _version_request(self, counts: LinkCounts, autopilot: tuple[int, int]) -> list[dialect.MAVLink_message]:
+        """Ask for the firmware's version, a few times; those that speak version 1 have none to tell."""
+        if counts.version != 2 or counts.firmware or self._version_tries >= _VERSION_TRIES:
+            return []
+        self._version_tries += 1
+        return [_command(autopilot, dialect.MAV_CMD_REQUEST_MESSAGE, float(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))]
+
+    def _asking(
+        self, counts: LinkCounts, autopilot: tuple[int, int], wanted: tuple[int, int, int]
+    ) -> list[dialect.MAVLink_message]:
+        """What asks for a stream: message by message, and if that brings nothing as the old firmwares want it, in turn."""
+        stream, rate, message = wanted
+        self._tries[message] += 1
+        if counts.version != 2 or self._tries[message] % 2 == 0:
+            return [dialect.MAVLink_request_data_stream_message(*autopilot, stream, rate, 1)]
+        return [
+            _command(autopilot, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), 1e6 / rate)
+            for number in (message, *_BESIDE.get(message, ()))
+        ]
+
     def _requests(self, counts: LinkCounts, autopilot: tuple[int, int], now_ns: int) -> list[dialect.MAVLink_message]:
+        streams = self._streams
+        if counts.kind == dialect.MAV_AUTOPILOT_PX4:
+            streams = [(stream, rate, _ON_PX4.get(message, message)) for stream, rate, message in streams]
         if self._checked_ns is None:
-            low = self._streams
+            low = streams
         elif now_ns - self._checked_ns < _CHECK_NS:
             return []
         else:
             seconds = (now_ns - self._checked_ns) / NS_PER_S
-            hz = {
-                message: (counts.messages[message] - self._before[message]) / seconds for *_, message in self._streams
-            }
+            hz = {message: (counts.messages[message] - self._before[message]) / seconds for *_, message in streams}
             counts.achieved_hz = {dialect.mavlink_map[message].msgname: round(rate, 1) for message, rate in hz.items()}
-            counts.asked_hz = {dialect.mavlink_map[message].msgname: rate for _, rate, message in self._streams}
-            low = [(stream, rate, message) for stream, rate, message in self._streams if hz[message] < LOW_RATE * rate]
+            counts.asked_hz = {dialect.mavlink_map[message].msgname: rate for _, rate, message in streams}
+            low = [(stream, rate, message) for stream, rate, message in streams if hz[message] < LOW_RATE * rate]
         self._checked_ns, self._before = now_ns, Counter(counts.messages)
         counts.requests += len(low)
-        return [dialect.MAVLink_request_data_stream_message(*autopilot, stream, rate, 1) for stream, rate, _ in low]
+        return [message for wanted in low for message in self._asking(counts, autopilot, wanted)]
+
+
+def _command(autopilot: tuple[int, int], command: int, *parameters: float) -> dialect.MAVLink_message:
+    """A COMMAND_LONG."""
+    values = (*parameters, *(0.0,) * (7 - len(parameters)))
+    return dialect.MAVLink_command_long_message(*autopilot, command, 0, *values)

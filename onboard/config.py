@@ -78,6 +78,10 @@ class LinkConfig:
         None, "ask the autopilot for the rates below; null: on a serial device yes, on UDP no"
     )
     streams: StreamsConfig = option(StreamsConfig, "rates to ask for")
+    signing_key: str | None = option(
+        None,
+        "file with the key of MAVLink 2 signing: frames without a right signature are recorded, and not believed; null: none",
+    )
 
     def __post_init__(self) -> None:
         if self.device is not None and self.device.startswith(_UDP):

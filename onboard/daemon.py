@@ -151,6 +151,7 @@ class Daemon:
             "fov_start_deg": f"{fov.start_deg:g}",
             "fov_end_deg": f"{fov.end_deg:g}",
             "segment": path.stem,
+            "signed_links": ",".join(name for name, link in settings.links().items() if link.signing_key is not None),
         }
         topics = [records.LIDAR.topic, records.LIDAR_ACCOUNT.topic, records.POSITION.topic]
         topics += [records.CLOCK_SYNC.topic]

@@ -91,6 +91,10 @@ class LinkStatus:
     asked_hz: dict[str, int] = field(default_factory=dict)
     """Of the messages asked for."""
     requests: int = 0
+    firmware: str = ""
+    """The autopilot's version; empty: it has not said."""
+    signatures: dict[str, int] = field(default_factory=dict)
+    """Frames by what their signatures say (good, unsigned, wrong, old); empty where no key is set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,6 +293,15 @@ def _judge_lidar(lidar: LidarStatus) -> list[tuple[Level, str]]:
 def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
     if not link.connected:
         return [(Level.WARNING, f"link {name}: {link.trouble or 'not open yet'}")]
+    refused = {word: count for word, count in link.signatures.items() if word != "good" and count}
+    if link.age_s is None and refused:
+        counts = ", ".join(f"{count} {word}" for word, count in refused.items())
+        return [
+            (
+                Level.WARNING,
+                f"link {name}: no autopilot with the key heard (signatures: {counts}); is signing set up on it, with this key?",
+            )
+        ]
     if link.age_s is None:
         return [(Level.WARNING, f"link {name}: open, but no autopilot heard")]
     if link.age_s > LINK_SILENT_S:
@@ -305,6 +318,9 @@ def _judge_link(name: str, link: LinkStatus) -> list[tuple[Level, str]]:
         for message, hz in link.achieved_hz.items()
         if hz < LOW_RATE * link.asked_hz.get(message, 0)
     ]
+    if refused:
+        counts = ", ".join(f"{count} {word}" for word, count in refused.items())
+        found.append((Level.WARNING, f"link {name}: frames recorded and not believed, by their signatures: {counts}"))
     if link.dropped_bytes:
         found.append(
             (Level.WARNING, f"link {name}: {link.dropped_bytes} bytes lost because the disk was too slow or full")
@@ -403,7 +419,8 @@ def _report_lidar(lidar: LidarStatus) -> list[str]:
 
 
 def _report_link(name: str, link: LinkStatus) -> list[str]:
-    heard = f"autopilot {link.autopilot}, MAVLink {link.version}" if link.autopilot else "no autopilot"
+    firmware = f", firmware {link.firmware}" if link.firmware else ""
+    heard = f"autopilot {link.autopilot}, MAVLink {link.version}{firmware}" if link.autopilot else "no autopilot"
     armed = {None: "unknown", True: "armed", False: "disarmed"}[link.armed]
     lines = [
         (

@@ -221,7 +221,10 @@ def _check_link(name: str, link: Link, config: LinkConfig, then: Counter[int], s
     system, component = counts.autopilot
     items = [_good(title, f"autopilot {system}/{component}, MAVLink {counts.version}, {counts.heartbeats} heartbeats")]
     if config.requests and seconds > 0:
-        hz = {m: ((counts.messages[n] - then[n]) / seconds, rate) for m, n, rate in streams_asked(config.streams)}
+        hz = {
+            m: ((counts.messages[n] - then[n]) / seconds, rate)
+            for m, n, rate in streams_asked(config.streams, counts.kind)
+        }
         low = any(found < LOW_RATE * rate for found, rate in hz.values())
         found = ", ".join(f"{message} {rate:.1f} of {asked} Hz" for message, (rate, asked) in hz.items())
         remedy = "set the SRx_ parameters of that port, or a faster baud rate" if low else ""

@@ -155,6 +155,8 @@ def link_status(name: str, counts: LinkCounts, log_ns: int, per_second: PerSecon
         achieved_hz=counts.achieved_hz,
         asked_hz=counts.asked_hz,
         requests=counts.requests,
+        firmware=counts.firmware,
+        signatures=counts.signatures,
     )
 
 

@@ -12,6 +12,7 @@ from flightlog import nmea, records
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame, FrameParser
+from flightlog.signing import is_signed
 from groundproc.flight import autopilot, load, merging, timebase, vehicle
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.boardlog import BoardLogs
@@ -39,6 +40,8 @@ class Flight:
         Whose boots these are, of the vehicles on the link.
     frames, bad_bytes, unknown : int
         MAVLink: frames read, bytes that belong to none, frames of messages outside the dialect.
+    unsigned : int
+        Frames left out because they are not signed, where the recorder had a key.
     board_logs, board_bad_bytes, board_not_finite : int
         Dataflash logs of the autopilot, bytes in them that belong to no message, and messages left out for values that are no numbers.
     """
@@ -53,6 +56,7 @@ class Flight:
     board_logs: int = 0
     board_bad_bytes: int = 0
     board_not_finite: int = 0
+    unsigned: int = 0
 
 
 def read_clocks(
@@ -92,8 +96,12 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     """
     lidar = lidar_of(readers)
     parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers, lidar))
-    logs, count, kept = BoardLogs(), 0, []
+    logs, count, kept, unsigned = BoardLogs(), 0, [], 0
+    needs_key = any(link in load.signed_links(reader) for reader in readers)
     for frame in _frames(readers, link, parser, (samples, logs), progress):
+        if needs_key and not is_signed(frame):
+            unsigned += 1
+            continue
         count += 1
         if frame.message_id in autopilot.WANTED:  # the rest would fill the memory of an hour
             kept.append(frame)
@@ -119,6 +127,7 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
         len(boards),
         logs.bad_bytes,
         logs.not_finite,
+        unsigned,
     )
 
 

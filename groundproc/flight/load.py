@@ -16,6 +16,7 @@ from flightlog.constants import HOUR_NS, NS_PER_S, NS_PER_US
 from flightlog.logfile import LogReader, Message
 from flightlog.mavlink import Frame, FrameParser
 from flightlog.records import LidarAccount
+from flightlog.signing import is_signed
 from groundproc.flight.lidar import lidar_of
 from groundproc.sensors import velodyne
 from groundproc.sensors.model import Lidar, Readings
@@ -331,6 +332,11 @@ def new_sentences(batch: PositionBatch, last: str) -> list[Sentence]:
     return found
 
 
+def signed_links(reader: LogReader) -> list[str]:
+    """Links whose frames had to be signed aboard: what is not, was not believed there, and is not here."""
+    return list(filter(None, reader.metadata.get("swath.session", {}).get("signed_links", "").split(",")))
+
+
 def mavlink_frames(
     readers: Sequence[LogReader],
     link: str,
@@ -351,7 +357,9 @@ def mavlink_frames(
     """
     parser = FrameParser() if parser is None else parser
     for reader in in_order(readers):
+        needs_key = link in signed_links(reader)
         for message in reader.messages((records.MAVLINK.topic + link,), progress):
             for time_ns, data in records.decode_raw(message.data):
-                yield from parser.feed(time_ns, data)
+                frames = parser.feed(time_ns, data)
+                yield from filter(is_signed, frames) if needs_key else frames
     yield from parser.finish()

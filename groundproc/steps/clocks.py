@@ -59,6 +59,7 @@ def work(run: Run, folders: Folders) -> None:
             "frames": flight.frames,
             "bad_bytes": flight.bad_bytes,
             "unknown_frames": flight.unknown,
+            "unsigned_frames": flight.unsigned,
             "board_logs": flight.board_logs,
             "board_log_bad_bytes": flight.board_bad_bytes,
             "board_log_not_finite": flight.board_not_finite,

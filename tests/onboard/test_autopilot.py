@@ -8,17 +8,18 @@ import termios
 import time
 import tty
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from linktape import Tape, until
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import records
 from flightlog.mavlink import FrameParser
-from onboard.autopilot import Link, LinkCounts, Requester, note_frames
-from onboard.config import LinkConfig, StreamsConfig
-from onboard.timesync import LogTime, read_clocks
+from onboard.autopilot import LinkCounts, Requester, note_frames
+from onboard.config import StreamsConfig
+from onboard.timesync import read_clocks
 
 S = 1_000_000_000
 
@@ -44,32 +45,6 @@ def arducopter(recordings: Path) -> list[bytes]:
         frames.append(raw[offset + 8 : offset + 8 + size])
         offset += 8 + size
     return frames
-
-
-class Tape:
-    """What a link handed over."""
-
-    def __init__(self) -> None:
-        self.messages: list[tuple[str, int, bytes]] = []
-        self.log_time = LogTime.start(read_clocks())
-
-    def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
-        assert vital
-        self.messages.append((topic, log_time_ns, data))
-        return True
-
-    def link(self, device: str, **more: object) -> Link:
-        return Link("ins", LinkConfig(device, **more), self.log_time, self.put)  # type: ignore[arg-type]
-
-    def bytes(self) -> bytes:
-        return b"".join(chunk for _, _, data in self.messages for _, chunk in records.decode_raw(data))
-
-
-def until(condition: Callable[[], bool], seconds: float = 90.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.01)
 
 
 class Pty:
