@@ -145,10 +145,10 @@ TABLE: Final = (
         "point_source_id", "u2", "point source", "The flight line or file that the point is from.", "other programs",
         field="point_source_id",
     ),
-    Dimension("red", "u2", "red", "Colour, 0 to 65535.", "other programs", field="red"),
-    Dimension("green", "u2", "green", "Colour, 0 to 65535.", "other programs", field="green"),
-    Dimension("blue", "u2", "blue", "Colour, 0 to 65535.", "other programs", field="blue"),
-    Dimension("nir", "u2", "near infrared", "Near infrared, 0 to 65535.", "other programs", field="nir"),
+    Dimension("red", "u2", "red", "Colour, 0 to 65535.", "`swath colour`", field="red"),
+    Dimension("green", "u2", "green", "Colour, 0 to 65535.", "`swath colour`", field="green"),
+    Dimension("blue", "u2", "blue", "Colour, 0 to 65535.", "`swath colour`", field="blue"),
+    Dimension("nir", "u2", "near infrared", "Near infrared, 0 to 65535.", "`swath colour`", field="nir"),
     Dimension("laser", "u1", "laser in firing order", "Number of the laser in the sensor's firing order, from 0.", "sensor"),
     Dimension(
         "azimuth", "u2", "azimuth", "Azimuth of the beam in the sensor frame at the laser's own instant, clockwise from straight ahead.",
@@ -174,6 +174,13 @@ TABLE: Final = (
     ),
     Dimension(
         "reflectance_sigma", "f4", "sigma of reflectance", "One standard deviation of the reflectance.", "`swath reflectance`",
+    ),
+    Dimension("red_edge", "u2", "red edge", "Light between red and near infrared, 0 to 65535.", "`swath colour`"),
+    Dimension(
+        "temperature", "f4", "temperature", "Of the surface, as a thermal camera has it.", "`swath colour`", "deg C",
+    ),
+    Dimension(
+        "views", "u1", "views", "Images that see the point, 255 at most; 0: it has no colour.", "`swath colour`",
     ),
     Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),
     Dimension("clearance", "f4", "to the nearest wire", "Distance to the nearest wire.", "wires", "m"),

@@ -49,8 +49,8 @@ class Rewriter:
         self._added = in_order(added)
         with opened(cloud.path) as reader:
             old = reader.header
-            self._format = _format(old.point_format, [entry for entry in self._added if not entry.field])
-            header = laspy.LasHeader(version=old.version, point_format=self._format)
+            self._format = _format(old.point_format, self._added)
+            header = laspy.LasHeader(version=_version(old.version, self._format), point_format=self._format)
             header.scales, header.offsets = old.scales, old.offsets
             header.global_encoding, header.uuid = old.global_encoding, old.uuid
             header.file_source_id = old.file_source_id
@@ -119,14 +119,14 @@ class Rewriter:
         out = laspy.ScaleAwarePointRecord.zeros(
             len(record), point_format=self._format, scales=record.scales, offsets=record.offsets
         )
-        new = {entry.name for entry in self._added if not entry.field}
+        new = {entry.name for entry in self._added if not _has_field(self._format, entry)}
         for name in record.array.dtype.names:
             if name not in new:
                 out.array[name] = record.array[name]
         for entry in self._added:
             values = np.asarray(columns[entry.name])
-            if entry.field or entry.scale is None:
-                out[entry.field or entry.name] = values
+            if entry.name not in new or entry.scale is None:
+                out[entry.name if entry.name in new else entry.field] = values
                 continue
             low, high = entry.steps()
             steps = np.rint(values / entry.scale)
@@ -136,16 +136,40 @@ class Rewriter:
         return out
 
 
+_WITH_COLOUR: Final = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
+"""Point formats with the same fields, and red, green and blue."""
+_WITH_NIR: Final = {6: 8, 7: 8, 9: 10}
+"""With near infrared too; the older ones have none, and get it as extra bytes."""
+
+
 def _format(old: Any, added: Sequence[Dimension]) -> Any:
-    """The point format of a cloud with more extra bytes."""
-    new = laspy.PointFormat(old.id)
-    names = {entry.name for entry in added}
+    """The point format of a cloud with more attributes: one that has their fields, where there is one, else with extra bytes."""
+    fields = {entry.field for entry in added}
+    number = old.id
+    if "nir" in fields:
+        number = _WITH_NIR.get(number, number)
+    if fields & {"red", "green", "blue"}:
+        number = _WITH_COLOUR.get(number, number)
+    new = laspy.PointFormat(number)
+    extra = [entry for entry in added if not _has_field(new, entry)]
+    names = {entry.name for entry in extra}
     for each in old.extra_dimensions:
         if each.name not in names:
             new.dimensions.append(each)
-    for entry in added:
+    for entry in extra:
         new.add_extra_dimension(extra_bytes(entry))
     return new
+
+
+def _has_field(point_format: Any, entry: Dimension) -> bool:
+    """Whether an attribute is a field of a point format, and not extra bytes."""
+    return bool(entry.field) and entry.field in set(point_format.standard_dimension_names)
+
+
+def _version(old: Any, point_format: Any) -> Any:
+    """The version of the file, or the first one that has the point format."""
+    least = laspy.header.Version.from_str(laspy.point.dims.preferred_file_version_for_point_format(point_format.id))
+    return old if point_format.id in laspy.point.dims.VERSION_TO_POINT_FMT.get(str(old), ()) else least
 
 
 def _is_extra_bytes(record: Any) -> bool:

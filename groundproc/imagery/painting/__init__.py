@@ -1,0 +1,1 @@
+"""What images show, carried onto surfaces: the colours of a cloud, mosaics, indices. A point takes only what could see it."""

@@ -1,0 +1,108 @@
+"""One layer of images laid over a cloud, image by image: who sees what, and the best views of each point."""
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.errors import CaptureError
+from groundproc.imagery import pictures
+from groundproc.imagery.painting import block as blocks
+from groundproc.imagery.painting import views as best
+from groundproc.imagery.painting.block import Block, Image, Layer
+from groundproc.imagery.painting.scene import Scene, Square, mapped, towards
+from groundproc.imagery.painting.views import Views
+from groundproc.imagery.painting.visibility import Depths, Seen, project
+
+_THREADS: Final = 2
+_EDGE: Final = 0.5
+"""Weight at the corner of a picture, of that in its middle: lenses are worst there."""
+
+
+def room(size: int, layer: Layer, folder: Path) -> Views:
+    """Empty views of so many points, in files."""
+    planes, dtype = len(layer.bands), layer.dtype
+    made = Views(
+        mapped(folder / "image", np.uint16, (size, best.MOST)),
+        mapped(folder / "weight", np.float32, (size, best.MOST)),
+        mapped(folder / "value", dtype if dtype.itemsize <= 4 else np.float32, (size, best.MOST, planes)),
+        mapped(folder / "total", np.uint8, (size,)),
+    )
+    made.image[:] = best.NOBODY
+    return made
+
+
+def part(views: Views, points: slice) -> Views:
+    """The views of some points."""
+    return Views(views.image[points], views.weight[points], views.value[points], views.total[points])
+
+
+def paint(block: Block, layer: Layer, scene: Scene, views: Views, progress: Callable[[int], object]) -> tuple[str, ...]:
+    """Lay all images of a layer over the points of a scene; gives what became of those that could not be read.
+
+    Parameters
+    ----------
+    block : Block
+    layer : Layer
+    scene : Scene
+    views : Views
+        Of all its points; filled.
+    progress : callable
+        Told of images done.
+    """
+    locks = {id(square): threading.Lock() for square in scene.squares}
+
+    def one(number: int) -> str:
+        image = layer.images[number]
+        try:
+            shown = pictures.picture(image.path)
+        except CaptureError as error:
+            return str(error)
+        for square, seen, weight in visible(block, image, scene):
+            with locks[id(square)]:
+                best.insert(part(views, square.points), shown, seen, weight, number)
+        progress(1)
+        return ""
+
+    with ExitStack() as stack:
+        pool = stack.enter_context(ThreadPoolExecutor(_THREADS))
+        running = [pool.submit(one, number) for number in range(len(layer.images))]
+        stack.callback(lambda: [each.cancel() for each in running])
+        return tuple(sentence for each in running if (sentence := each.result()))
+
+
+def visible(block: Block, image: Image, scene: Scene) -> Iterator[tuple[Square, Seen, npt.NDArray[np.float32]]]:
+    """The points that an image sees, square by square, with the weights of its view of them."""
+    camera = block.rig.cameras[image.camera].camera
+    near = list(towards(scene.squares, image.eye.place_m, image.axis, blocks.half_angle_rad(camera)))
+    looked = [(square, seen) for square in near if len((seen := _in_picture(image, scene, square)).number)]
+    if not looked:
+        return
+    usual_m = float(
+        np.median(np.concatenate([seen.range_m[:: max(1, len(seen.range_m) // 1000)] for _, seen in looked]))
+    )
+    depths = Depths(image.eye, camera.focal_px, float(np.median([square.spacing_m for square, _ in looked])), usual_m)
+    for square, seen in looked:
+        depths.add(seen, scene.spacing_m[square.points][seen.number])
+    for square, seen in looked:
+        clear = depths.sees(seen, scene.surface(square), image.eye.place_m - square.centre_m)
+        some = Seen(seen.number[clear], seen.pixel[clear], seen.range_m[clear])
+        if len(some.number):
+            yield square, some, _weights(some, camera.width_px, camera.height_px)
+
+
+def _in_picture(image: Image, scene: Scene, square: Square) -> Seen:
+    eye = image.eye._replace(place_m=image.eye.place_m - square.centre_m)
+    return project(eye, scene.xyz_m[square.points])
+
+
+def _weights(seen: Seen, width_px: int, height_px: int) -> npt.NDArray[np.float32]:
+    """Of views: near is better, and the middle of the picture."""
+    off = (seen.pixel - 0.5 * np.array([width_px, height_px], np.float32)) / (0.5 * np.hypot(width_px, height_px))
+    taper = 1.0 - (1.0 - _EDGE) * (off**2).sum(axis=1)
+    return np.asarray(taper / np.maximum(seen.range_m, 0.1) ** 2, np.float32)
