@@ -51,6 +51,8 @@ $(VENV)/.python: $(VENV)/.apt
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@# a test lets MAVProxy show our messages; what it would bring along (vtk, opencv) is not needed for that
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
 	@$(BIN)/swath warmup || echo "warning: swath warmup failed: what is not compiled yet is compiled at first use" >&2
 	@touch $@
 
