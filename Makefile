@@ -7,6 +7,7 @@
 #   make bench-NAME  one benchmark of benchmarks/; its last line is one JSON object
 #   make bench       all of them, into docs/benchmarks.md, but the longest: `benchmarks/all.py --only kit study windows`
 #   make deb         dist/swathd_VERSION_{amd64,arm64}.deb, for the payload computer
+#   make release     dist/VERSION/: wheel, sdist, the packages, notes, SBOM and checksums; publishes nothing
 #   make clean       everything made, the environment included
 
 SHELL := /bin/bash
@@ -19,7 +20,7 @@ PYTEST := $(BIN)/pytest
 # A file of tests stays on one worker, so that what its fixtures made is made once.
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: setup demo test check soak bench deb clean
+.PHONY: setup demo test check soak bench deb release clean
 
 setup: $(VENV)/.installed
 
@@ -82,6 +83,9 @@ bench-%: setup
 
 deb: setup
 	$(BIN)/python package/deb.py
+
+release: setup
+	$(BIN)/python package/release.py
 
 bench: setup
 	@$(BIN)/python benchmarks/all.py
