@@ -44,7 +44,9 @@ class GyroOptions:
         (-23.1, -7.1, -12.3), "zero offsets of gyro 1, 2, 3 [deg/s]; tens are normal", minimum=-150, maximum=150
     )
     noise_deg_s: float = option(1.1, "white noise of a sample, one sigma [deg/s]", minimum=0, maximum=50)
-    rotor_line_deg_s: float = option(0.3, "amplitude at the rotor's frequency [deg/s]", minimum=0, maximum=50)
+    rotor_line_deg_s: tuple[float, float, float] = option(
+        (0.5, 0.6, 0.2), "amplitude at the rotor's frequency of gyro 1, 2, 3 [deg/s]", minimum=0, maximum=50
+    )
     accel_noise_g: float = option(0.015, "white noise of a sample, one sigma [g]", minimum=0, maximum=2)
     accel_rotor_line_g: float = option(0.04, "amplitude at the rotor's frequency [g]", minimum=0, maximum=2)
     offset_walk_deg_s: float = option(
@@ -91,6 +93,18 @@ class FlightOptions:
     higher_m: float = option(0.0, "the route lies so much higher [m]", minimum=-100, maximum=1000)
     vibration_deg: float = option(
         0.03, "rotor vibration of each attitude angle, rms [deg], 15 to 40 Hz", minimum=0, maximum=5
+    )
+    buzz_deg_s: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0),
+        "vibration of the motors and blades, rate of heading, pitch, roll, rms [deg/s], 85 to 240 Hz: faster than gyros are read",
+        minimum=0,
+        maximum=50,
+    )
+    gust_deg: float = option(
+        0.0,
+        "what gusts and control make of each attitude angle beyond its wander, rms [deg], 3 to 20 Hz",
+        minimum=0,
+        maximum=5,
     )
     wander_deg: float = option(
         1.6, "tilt from gusts and control, rms of roll and of pitch [deg]", minimum=0, maximum=10
@@ -323,7 +337,7 @@ def perfect(options: Options, part: str = "all") -> Options:
                 intensity_noise=0.0,
                 encoder_noise_deg=0.0,
             ),
-            gyros=GyroOptions((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0),
+            gyros=GyroOptions((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0.0, 0.0),
             clocks=dataclasses.replace(options.clocks, arrival_jitter_us=0.0),
         )
     if part in ("ins", "all"):
@@ -334,7 +348,7 @@ def perfect(options: Options, part: str = "all") -> Options:
         }
         options = dataclasses.replace(
             options,
-            flight=dataclasses.replace(options.flight, vibration_deg=0.0),
+            flight=dataclasses.replace(options.flight, vibration_deg=0.0, buzz_deg_s=(0.0, 0.0, 0.0), gust_deg=0.0),
             ins=dataclasses.replace(options.ins, **zeros),
             link=dataclasses.replace(options.link, stamp_jitter_s=0.0, latency_jitter_s=0.0),
         )

@@ -23,6 +23,8 @@ Array = npt.NDArray[np.float64]
 
 _VIBRATION_LINES: Final = 9
 _WANDER_LINES: Final = 14
+_GUST_LINES: Final = 12
+_BUZZ_LINES: Final = 12
 _GENTLE_S: Final = 3.0
 _BLOCK: Final = 20_000
 _SHARE: Final = {"copter": 1.0, "car": 0.35, "tripod": 0.0}
@@ -82,6 +84,24 @@ def _sines(rng: np.random.Generator, lines: int, band_hz: tuple[float, float], r
     return _Sines(strength, frequency, rng.uniform(0, 2 * np.pi, shape))
 
 
+def _both(one: _Sines, other: _Sines) -> _Sines:
+    """The sum of two sums."""
+    parts = ("amplitude", "frequency_hz", "phase")
+    return _Sines(*(np.concatenate([getattr(one, name), getattr(other, name)]) for name in parts))
+
+
+def _shaking(options: FlightOptions, seed: int, share: float, slow: _Sines) -> _Sines:
+    """Turns of the frame: vibration of 15 to 40 Hz, and what gusts and motors add where they are asked for."""
+    if options.gust_deg > 0.0:
+        rms = share * np.radians(options.gust_deg)
+        slow = _both(slow, _sines(generator(seed, "gusts"), _GUST_LINES, (3.0, 20.0), rms))
+    if any(options.buzz_deg_s):
+        rates = _sines(generator(seed, "buzz"), _BUZZ_LINES, (85.0, 240.0), 1.0)
+        amplitude = share * np.radians(options.buzz_deg_s) * rates.amplitude / (2.0 * np.pi * rates.frequency_hz)
+        slow = _both(slow, _Sines(amplitude, rates.frequency_hz, rates.phase))
+    return slow
+
+
 def _smooth_step(share: Array) -> Array:
     s = np.clip(share, 0.0, 1.0)
     return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
@@ -116,7 +136,8 @@ class Flight:
             points = tuple((x, y, z + options.higher_m) for x, y, z in route.points_m)
             route = dataclasses.replace(route, points_m=points)
         self.duration_s = duration_s
-        self._vibration = _sines(rng, _VIBRATION_LINES, (15.0, 40.0), share * np.radians(options.vibration_deg))
+        slow = _sines(rng, _VIBRATION_LINES, (15.0, 40.0), share * np.radians(options.vibration_deg))
+        self._vibration = _shaking(options, seed, share, slow)
         tilt = _sines(rng, _WANDER_LINES, (0.2, 3.0), share * np.radians(options.wander_deg))
         wander = _Sines(
             STANDARD_GRAVITY_M_S2 * tilt.amplitude / (2 * np.pi * tilt.frequency_hz) ** 2, tilt.frequency_hz, tilt.phase

@@ -114,7 +114,7 @@ class Telemetry:
         rates = np.degrees(self._flight.rates_rad_s(time_s)) @ self._mat_lidar_ins.T
         gyros = self.gyros.read(rates @ SENSOR_FROM_GYROS.astype(np.float64)) + self.gyro_wander.at(time_s)
         gyros = gyros + o.noise_deg_s * rng.standard_normal(gyros.shape)
-        gyros = gyros + o.rotor_line_deg_s * np.sin(turn + np.array([0.3, 1.9, 3.1]))
+        gyros = gyros + np.array(o.rotor_line_deg_s) * np.sin(turn + np.array([0.3, 1.9, 3.1]))
         force = self._flight.specific_force_m_s2(time_s, self._lever_m) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
         # readings are the pull of gravity along the labelled arrow, minus the specific force: X up is -z on chips 1 and 2
         x, y, z = force.T

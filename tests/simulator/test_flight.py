@@ -119,3 +119,24 @@ def test_vibration_is_as_strong_as_asked_and_has_no_part_in_the_position():
     difference = np.degrees(shaken.poses(time_s).pitch_rad - calm.poses(time_s).pitch_rad)
     assert difference.std() == pytest.approx(0.1, rel=0.1)
     assert (shaken.poses(time_s).position_m == calm.poses(time_s).position_m).all()
+
+
+def test_motors_shake_the_rates_as_asked_and_faster_than_gyros_are_read():
+    """Rates of 0.5, 1.8 and 1.8 deg/s RMS above 85 Hz: next to nothing of it is motion, and none of it is in the position."""
+    asked = (0.5, 1.8, 1.8)
+    shaken, calm = (Flight(SQUARE, 10.0, FlightOptions(buzz_deg_s=b), seed=2) for b in (asked, (0.0, 0.0, 0.0)))
+    time_s = np.arange(0.0, 10.0, 0.0005)
+    poses, still = shaken.poses(time_s), calm.poses(time_s)
+    assert (poses.position_m == still.position_m).all()
+    for name, rms in zip(("heading_rad", "pitch_rad", "roll_rad"), asked, strict=True):
+        angle = np.degrees(getattr(poses, name) - getattr(still, name))
+        assert np.gradient(angle, time_s).std() == pytest.approx(rms, rel=0.15)
+        assert angle.std() < rms / (2 * np.pi * 85)
+
+
+def test_gusts_are_as_strong_as_asked():
+    gusty, calm = (Flight(SQUARE, 10.0, FlightOptions(gust_deg=g), seed=2) for g in (0.05, 0.0))
+    time_s = np.arange(0.0, 10.0, 0.001)
+    for name in ("heading_rad", "pitch_rad", "roll_rad"):
+        difference = np.degrees(getattr(gusty.poses(time_s), name) - getattr(calm.poses(time_s), name))
+        assert difference.std() == pytest.approx(0.05, rel=0.15)

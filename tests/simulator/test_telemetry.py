@@ -161,3 +161,35 @@ def test_statistics_are_of_the_size_of_a_real_recordings(simulate):
     assert np.quantile(np.diff(stamps_us(ours)), [0.05, 0.5, 0.95]) == pytest.approx(
         np.quantile(np.diff(stamps_us(real)), [0.05, 0.5, 0.95]), rel=0.15
     )
+
+
+def test_gyros_have_a_line_at_the_rotors_frequency_on_each_axis(simulate):
+    """Against the recording of a sensor on a tripod (below): 0.5, 0.6 and 0.2 deg/s by default."""
+    options = perfect(Options())
+    gyros = replace(options.gyros, rotor_line_deg_s=(2.0, 3.0, 1.0))
+    flight = simulate("panels", 8.0, dark(replace(options, gyros=gyros)))
+    payloads = flight.capture.payloads(512)
+    assert lines_of(payloads, 10.0) == pytest.approx([2.0, 3.0, 1.0], abs=0.02)
+
+
+def lines_of(payloads, hz):
+    """Amplitude at a frequency of each gyro [deg/s], a parabola taken off."""
+    reading, time_s = values_of(payloads)[:, [0, 4, 8]] * 0.09766, stamps_us(payloads) * 1e-6
+    time_s = time_s - time_s[0]
+    turn = 2 * np.pi * hz * time_s
+    columns = np.stack([np.ones_like(turn), time_s, time_s**2, np.sin(turn), np.cos(turn)], axis=1)
+    found = np.linalg.lstsq(columns, reading, rcond=None)[0]
+    return np.hypot(found[3], found[4])
+
+
+@pytest.mark.skipif(RECORDINGS is None, reason="SWATH_RECORDINGS is not set")
+def test_the_default_lines_are_those_of_the_recording_on_a_tripod():
+    """1.5 s at 706.5 rpm, noise of 1 to 2 deg/s: amplitudes are known to 0.1 to 0.2 deg/s, one sigma."""
+    blob, payloads, at = (Path(RECORDINGS) / "lidar/hdl32e_monterey.pcap").read_bytes(), [], 24
+    while at < len(blob):
+        (size,) = struct.unpack_from("<I", blob, at + 8)
+        if size == 42 + 512:
+            payloads.append(np.frombuffer(blob, np.uint8, 512, at + 16 + 42))
+        at += 16 + size
+    found = lines_of(np.array(payloads), 706.511 / 60)
+    assert found == pytest.approx(Options().gyros.rotor_line_deg_s, abs=0.2)

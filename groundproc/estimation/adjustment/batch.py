@@ -87,7 +87,8 @@ class Batch:
 
     def state(self, learn: bool = False) -> State:
         """What the observations share."""
-        return State(self.path, self.lidar.clusters, self.mat_sensor_ins, learn)
+        spin = None if self.lidar.spin is None else self.lidar.spin.at_knots()
+        return State(self.path, self.lidar.clusters, self.mat_sensor_ins, learn, spin)
 
     def unknowns(self) -> Unknowns:
         """The unknowns that this flight's instruments have."""
@@ -106,7 +107,7 @@ class Batch:
         """
         unknowns = self.unknowns()
         rows = self.lidar.rows(self.path, voxel_m, cut)
-        factors, figures = linearised(self.observations, self.state(learn), unknowns)
+        factors, figures = linearised((self.lidar, *self.observations), self.state(learn), unknowns)
         linear = problem(rows, factors, unknowns, DEFLATION, self.path)
         x, steps = linear.solve(-linear.gradient, share=0.0 if cut else ROUGH)
         cost, used = rows.cost()
@@ -126,7 +127,7 @@ class Batch:
     def take(self, unknowns: Unknowns, x: Array) -> None:
         """Put a solution in."""
         part = {name: x[place] for name, place in unknowns.names.items()}
-        self.path = corrected(self.path, unknowns, x)
+        self.path = self.lidar.turned(corrected(self.path, unknowns, x), part)
         for each in (self.lidar, *self.observations):
             each.take(part, self.path)
 

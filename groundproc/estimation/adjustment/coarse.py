@@ -153,12 +153,12 @@ def coarse_of(rows: Rows, deflation: float, normal: sparse.csr_matrix, path: Pat
     matrix = (prolongation.T @ normal @ prolongation).toarray()
     size = inner.shape[1]
     matrix[:size, :size] += lidar_between(rows, nodes) / deflation
-    if rows.lasers is not None:
-        of_lasers = slice(size, size + len(rows.lasers.corner))
-        border = inner.T @ rows.lasers.border.T / deflation
-        matrix[:size, of_lasers] += border
-        matrix[of_lasers, :size] += border.T
-        matrix[of_lasers, of_lasers] += rows.lasers.corner / deflation
+    if rows.more:
+        further = slice(size, size + len(rows.corner))
+        border = inner.T @ rows.border.T / deflation
+        matrix[:size, further] += border
+        matrix[further, :size] += border.T
+        matrix[further, further] += rows.corner / deflation
     return Coarse(nodes.rigid(inner), sparse.csr_matrix(prolongation), cho_factor(matrix, check_finite=False))
 
 

@@ -106,8 +106,8 @@ def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation
     normal, gradient = normal_equations(factors)
     gradient[: rows.size] += rows.gradient() / deflation
     band = _sparse_band(rows.band() * (SHARE / deflation), unknowns.size)
-    if rows.lasers is not None:
-        band = band + _sparse_corner(rows.lasers.corner / deflation, rows.path_size, unknowns.size)
+    if rows.more:
+        band = band + _sparse_corner(rows.corner / deflation, rows.path_size, unknowns.size)
     fine = splu(
         (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
     )

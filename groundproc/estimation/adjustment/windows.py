@@ -18,12 +18,14 @@ from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, pa
 from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
 from groundproc.estimation.observations import lasers
+from groundproc.estimation.observations.inertial import gyro_readings
 from groundproc.estimation.observations.lidar import Lidar
 from groundproc.estimation.observations.observation import Observation, Stretch
 from groundproc.estimation.observations.rows import H, Unknowns
+from groundproc.estimation.observations.spin import spin_of
 from groundproc.estimation.observations.tie import Tie
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
-from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.motion import LIDAR, Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
 from groundproc.trajectory.covariance import SIZE
@@ -164,6 +166,10 @@ def adjust_window(
     stretch = Stretch(path, motion.source, bias, whole=not before and not more)
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart))
+    if motion.source == LIDAR:
+        lidar.spin = spin_of(lidar.clusters, path)
+        if lidar.spin is not None:
+            lidar.spin.read(gyro_readings(observations))
     track.forget(last - OVERLAP if more else last)
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()

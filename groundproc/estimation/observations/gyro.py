@@ -37,8 +37,11 @@ def knot_rates(path: Path) -> Array:
     return np.asarray(turn / ((last - first) * STEP_NS * 1e-9)[:, None])
 
 
-def turn_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
-    """Turns over each slice as the unit's gyro has them against those of the path."""
+def turn_factor(unit: Unit, path: Path, unknowns: Unknowns, spin_rad: Array | None = None) -> Factor:
+    """Turns over each slice as the unit's gyro has them against those of the path.
+
+    `spin_rad`, shape (intervals + 1, 3), is what the path has at its knots and the gyro has not: the line of the spin.
+    """
     rate = unit.true_rate()
     free = integrated(rate, np.array([1.0, 0.0, 0.0, 0.0]))[::STEPS]
     step = frames.quat_multiply(frames.quat_inverse(free[:-1]), free[1:])
@@ -47,6 +50,8 @@ def turn_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     good = np.flatnonzero(unit.known.reshape(-1, STEPS).all(axis=1))
     residual = frames.quat_log(frames.quat_multiply(frames.quat_inverse(step), made))[good]
     back = np.swapaxes(frames.mat_from_quat(made[good]), 1, 2)
+    if spin_rad is not None:
+        residual -= spin_rad[good + 1] - np.einsum("nij,nj->ni", back, spin_rad[good])
     # scales act on the turn of the path: the unit's own has the noise of the very reading in it that it is to explain
     turned = frames.quat_log(made[good])
     builder = RowBuilder(3 * len(good), unknowns)

@@ -1,6 +1,6 @@
 """An inertial unit as an observation of the adjustment: its gyro and its accelerometer, which share axes, clock and place."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -80,7 +80,7 @@ class Inertial(Observation):
         Learnt again and again, the path would follow the units and their noise seem to vanish.
         """
         unit = self._begun()
-        turn = gyro.turn_factor(unit, state.path, unknowns)
+        turn = gyro.turn_factor(unit, state.path, unknowns, state.spin_rad if self.carries else None)
         if state.learn:
             unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), LEAST_SHARE * unit.sigma_turn_rad)
             turn.sigma[:] = unit.sigma_turn_rad
@@ -113,6 +113,17 @@ class Inertial(Observation):
     def _begun(self) -> Unit:
         assert self.unit is not None, "the window has not begun"
         return self.unit
+
+
+def gyro_readings(observations: Sequence[Observation]) -> list[tuple[Array, npt.NDArray[np.bool_]]]:
+    """Rates that the carrying gyro reads on the grid of a window, and which are known: by themselves, and less those of the other unit."""
+    units = [each for each in observations if isinstance(each, Inertial) and each.unit is not None]
+    found = []
+    for own in (each.unit for each in units if each.carries and each.unit is not None):
+        found.append((own.rate_rad_s, own.known))
+        others = (each.unit for each in units if not each.carries and each.unit is not None)
+        found += [(own.rate_rad_s - other.rate_rad_s, own.known & other.known) for other in others]
+    return found
 
 
 def of_run(flown: Flown) -> list[Observation]:

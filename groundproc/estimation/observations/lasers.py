@@ -5,7 +5,7 @@ the planes are solved for within as before (`planes`); what couples lasers and p
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -50,16 +50,12 @@ class LaserColumns:
         Of each row.
     change : ndarray of float32, shape (n, 2)
         By the laser's range offset [1] and by its elevation [m/rad].
-    border : ndarray, shape (UNKNOWNS, path)
-        Normal matrix between corrections and path; empty until `prepare`.
-    corner : ndarray, shape (UNKNOWNS, UNKNOWNS)
-        The same of the corrections alone.
     """
+
+    UNKNOWNS: ClassVar[int] = UNKNOWNS
 
     laser: npt.NDArray[np.int32]
     change: npt.NDArray[np.float32]
-    border: Array
-    corner: Array
 
     @property
     def arrays(self) -> LaserArrays:
@@ -176,9 +172,7 @@ def columns_of(laser: npt.NDArray[np.int32], xyz_m: npt.NDArray[np.float32], nor
     level = np.maximum(level, 1e-6)
     ahead = (normal[:, 0] * xyz_m[:, 0] + normal[:, 1] * xyz_m[:, 1]) / level
     by_elevation = normal[:, 2] * level - ahead * xyz_m[:, 2]
-    return LaserColumns(
-        laser, np.stack([by_range, by_elevation], axis=1).astype(np.float32), np.zeros((0, 0)), np.zeros((0, 0))
-    )
+    return LaserColumns(laser, np.stack([by_range, by_elevation], axis=1).astype(np.float32))
 
 
 def shifted(xyz_m: npt.NDArray[np.float32], laser: npt.NDArray[np.int32], change: Array) -> npt.NDArray[np.float32]:

@@ -5,16 +5,18 @@ Its rows are hundreds of thousands and touch each other all over the flight, so 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.observations import lasers
+from flightlog import frames
+from groundproc.estimation.observations import lasers, spin
 from groundproc.estimation.observations.observation import Observation, Outcome, State
 from groundproc.estimation.observations.planes import Rows, rows_of
 from groundproc.estimation.observations.rows import Factor, Unknowns
+from groundproc.estimation.observations.spin import Spin
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.spline import Path
 
@@ -41,37 +43,50 @@ class Lidar(Observation):
         Those of single lasers are corrected in place.
     corrections : ndarray, shape (64,)
         Of the lasers, so far; they stay 0 where the clusters have none.
+    spin : Spin or None
+        The rotor and its line, where the lidar's own gyro carries the motion.
     """
 
     clusters: Clusters
     corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
+    spin: Spin | None = None
     name: str = "lidar planes"
 
     def unknowns(self, unknowns: Unknowns) -> None:
-        """Offsets of the lasers where they are asked for; they have to follow the path."""
-        if self.clusters.laser is None:
-            return
-        count = len(lasers.NAMES)
-        priors, values = np.split(lasers.PRIOR, count), np.split(self.corrections, count)
-        for name, prior, value in zip(lasers.NAMES, priors, values, strict=True):
-            unknowns.add(name, prior, value)
+        """Offsets of the lasers where they are asked for, and the line of the spin; they have to follow the path."""
+        if self.clusters.laser is not None:
+            count = len(lasers.NAMES)
+            priors, values = np.split(lasers.PRIOR, count), np.split(self.corrections, count)
+            for name, prior, value in zip(lasers.NAMES, priors, values, strict=True):
+                unknowns.add(name, prior, value)
+        if self.spin is not None:
+            self.spin.unknowns(unknowns)
 
     def rows(self, path: Path, voxel_m: float, cut: bool) -> Rows:
         """Distances from planes, linear about a path; voxels have edges of `voxel_m`, outliers are `cut` or only weigh less."""
-        return rows_of(self.clusters, path, voxel_m, MOST, cut, MOST_FILLED)
+        return rows_of(self.clusters, path, voxel_m, MOST, cut, MOST_FILLED, self.spin is not None)
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
-        """None: see `rows`."""
-        del state, unknowns
-        return []
+        """What is known of the line of the spin; all else is in `rows`."""
+        del state
+        return [] if self.spin is None else self.spin.factors(unknowns)
 
     def take(self, part: Mapping[str, Array], path: Path) -> None:
-        """Shift what each laser saw."""
+        """Shift what each laser saw, and know the line."""
         del path
+        if self.spin is not None:
+            self.spin.take(part)
         if self.clusters.laser is not None:
             offsets = np.concatenate([part[name] for name in lasers.NAMES])
             self.clusters.xyz_m = lasers.shifted(self.clusters.xyz_m, self.clusters.laser, offsets)
             self.corrections = self.corrections + offsets
+
+    def turned(self, path: Path, part: Mapping[str, Array]) -> Path:
+        """A path turned by what a solution found of the line."""
+        if self.spin is None:
+            return path
+        turn = frames.quat_exp(self.spin.turns(part[spin.NAME]))
+        return replace(path, quat=frames.quat_multiply(path.quat, turn))
 
     def warnings(self, outcome: Outcome) -> list[str]:
         """A map that is not one."""

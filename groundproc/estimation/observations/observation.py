@@ -84,12 +84,15 @@ class State:
         Boresight before the global `BORESIGHT`.
     learn : bool
         Noise is to be learnt from the residuals now: once, after the first step.
+    spin_rad : ndarray, shape (intervals + 1, 3), optional
+        What the path has at its knots that its carrying gyro has not: the line of the spin.
     """
 
     path: Path
     clusters: Clusters
     mat_sensor_ins: Array
     learn: bool = False
+    spin_rad: Array | None = None
 
     def boresight(self, unknowns: Unknowns) -> tuple[Array, str | None]:
         """Sensor from ins as estimated so far, shape (3, 3), and the global that corrects it where it is an unknown."""

@@ -1,6 +1,6 @@
 """What the lidar says: clusters on the planes of their voxels, as rows that tell of the path (`numerics.planerows`)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from numba import njit
 
 from groundproc.estimation.observations.filled import filled_rows
 from groundproc.estimation.observations.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
+from groundproc.estimation.observations.spin import SpinColumns, spin_columns
 from groundproc.estimation.observations.told import Poses, keep_told
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
@@ -32,55 +33,74 @@ ROUGHNESS_M: Final = 0.006
 
 @dataclass(slots=True)
 class Rows(PlaneRows):
-    """Rows of a path, with the corrections of the lasers as further unknowns where they are asked for.
+    """Rows of a path, with the corrections of the lasers and the line of the spin as further unknowns where they are asked for.
 
     Attributes
     ----------
-    lasers : LaserColumns, optional
-        By the corrections of the lasers, whose unknowns follow those of the path.
+    more : list of LaserColumns or SpinColumns
+        By further unknowns, which follow those of the path.
+    border : ndarray, shape (further, path)
+        Normal matrix between them and the path, planes solved for within.
+    corner : ndarray, shape (further, further)
+        The same of them alone.
     """
 
-    lasers: LaserColumns | None = None
+    more: "list[LaserColumns | SpinColumns]" = field(default_factory=list)
+    border: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    corner: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def size(self) -> int:
-        """Unknowns of the path and of the lasers."""
-        return self.path_size + (0 if self.lasers is None else UNKNOWNS)
+        """Unknowns of the path, and further ones."""
+        return self.path_size + len(self.corner)
 
     def apply(self, vector: Array) -> Array:
         """The normal matrix of the lidar times a vector, shape (size,)."""
-        path = vector[: self.path_size]
-        if self.lasers is None:
-            return PlaneRows.apply(self, path)
-        lasers, corrections = self.lasers, vector[self.path_size :]
-        return np.concatenate(
-            [
-                PlaneRows.apply(self, path) + corrections @ lasers.border,
-                lasers.border @ path + lasers.corner @ corrections,
-            ]
-        )
+        path, further = vector[: self.path_size], vector[self.path_size :]
+        out = PlaneRows.apply(self, path)
+        if not self.more:
+            return out
+        return np.concatenate([out + further @ self.border, self.border @ path + self.corner @ further])
 
     def spread(self, values_m: Array) -> Array:
         """The columns of all unknowns times values of the rows, shape (n,), weighed and less the best plane of each voxel."""
         by_path = PlaneRows.spread(self, values_m)
-        if self.lasers is None:
-            return by_path
-        return np.concatenate([by_path, self.lasers.gradient(self.projected(values_m))])
+        return np.concatenate([by_path, self._gradient(self.projected(values_m))]) if self.more else by_path
 
     def along(self, vector: Array) -> Array:
         """The rows times a vector of unknowns, shape (n,)."""
-        out = PlaneRows.along(self, vector[: self.path_size])
-        return out if self.lasers is None else out + self.lasers.along(vector[self.path_size :])
+        out, at = PlaneRows.along(self, vector[: self.path_size]), self.path_size
+        for each in self.more:
+            out = out + each.along(vector[at : at + each.UNKNOWNS])
+            at += each.UNKNOWNS
+        return out
 
     def with_lasers(self, laser: npt.NDArray[np.int32], xyz_m: Singles, normal: Array) -> None:
         """Take the corrections of the lasers in: each row's laser, its cluster and its plane's normal in the sensor frame."""
         lasers = columns_of(laser, xyz_m, normal)
-        lasers.border, lasers.corner = np.zeros((UNKNOWNS, self.path_size)), np.zeros((UNKNOWNS, UNKNOWNS))
-        border_of(self.arrays, lasers.arrays, lasers.border, lasers.corner)
-        self.lasers = lasers
+        border, corner = np.zeros((UNKNOWNS, self.path_size)), np.zeros((UNKNOWNS, UNKNOWNS))
+        border_of(self.arrays, lasers.arrays, border, corner)
+        self.more, self.border, self.corner = [lasers], border, corner
+
+    def with_spin(self, xyz_m: Singles) -> None:
+        """Take the line of the spin in, after the lasers': each row's cluster in the sensor frame."""
+        spin, path = spin_columns(self.jacobian, xyz_m), self.path_size
+        self.more = [*self.more, spin]
+        products = np.array([self.spread(spin.column(number)) for number in range(spin.UNKNOWNS)])
+        before = len(self.corner)
+        self.border = np.concatenate([self.border.reshape(-1, path), products[:, :path]])
+        corner = np.zeros((before + spin.UNKNOWNS, before + spin.UNKNOWNS))
+        corner[:before, :before], corner[before:] = self.corner, products[:, path:]
+        corner[:before, before:] = corner[before:, :before].T
+        self.corner = corner
+
+    def _gradient(self, projected: Array) -> Array:
+        return np.concatenate([each.gradient(projected) for each in self.more])
 
 
-def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool, filled: int = 0) -> Rows:
+def rows_of(
+    clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool, filled: int = 0, spin: bool = False
+) -> Rows:
     """Put clusters into voxels where the path places them, find the planes and what fills its voxel instead, and linearise.
 
     Parameters
@@ -94,6 +114,8 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
         Whether rows beyond `CUT` sigmas are dropped: not while the path is still rough.
     filled : int
         Clusters of a slice on what fills its voxel that are used.
+    spin : bool
+        Whether the line of the spin is an unknown.
     """
     world, rotation, knot, weights = _place_all(clusters, path)
     voxel, voxels = assign(world, voxel_m)
@@ -127,6 +149,8 @@ def rows_of(clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool
     if clusters.laser is not None:
         in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
         rows.with_lasers(clusters.laser[kept], xyz, in_sensor)
+    if spin:
+        rows.with_spin(xyz)
     return rows
 
 

@@ -27,6 +27,10 @@ LEAST_BASE_HZ: Final = 20.0
 """A gyro slower than this does not carry the motion between two revolutions."""
 
 
+LIDAR: Final = "lidar"
+"""Name of the lidar's own unit."""
+
+
 @dataclass(frozen=True, slots=True)
 class ImuTrack:
     """Samples of one inertial unit over one leg.
@@ -82,7 +86,7 @@ def lidar_imu(run: LidarRun, leg: Leg, mat_ins_lidar: Array) -> ImuTrack | None:
             rate = rate @ axes.T
     time_ns = leg.utc_from_lidar(run.gyro.time_ns)
     force = run.force_m_s2 if np.ptp(run.force_m_s2) > 0.0 else np.full_like(rate, np.nan)
-    return ImuTrack("lidar", time_ns, rate, force, _noise(rate), _noise(force))
+    return ImuTrack(LIDAR, time_ns, rate, force, _noise(rate), _noise(force))
 
 
 INS_FORCES: Final = (

@@ -8,7 +8,7 @@ import pytest
 
 from flightlog import frames
 from flightlog.hdl32e import ELEVATION_DEG, LASERS
-from groundproc.estimation.observations.lasers import PRIOR, UNKNOWNS, Corrections, shifted
+from groundproc.estimation.observations.lasers import PRIOR, UNKNOWNS, Corrections, LaserColumns, shifted
 from groundproc.estimation.observations.planes import Rows, rows_of
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
@@ -76,8 +76,8 @@ def test_distances_change_as_the_columns_say(path: Path, rows: Rows) -> None:
     moved = replace(clusters, xyz_m=shifted(clusters.xyz_m, clusters.laser, change))
     off = (in_world(path, moved) - in_world(path, clusters))[rows.cluster]
     along = np.einsum("ni,ni->n", off, rows.jacobian[:, 3:])
-    lasers = rows.lasers
-    assert lasers is not None
+    (lasers,) = rows.more
+    assert isinstance(lasers, LaserColumns)
     stated = np.einsum("nk,kn->n", lasers.change, change.reshape(2, LASERS)[:, lasers.laser])
     # second order: half of 12 m times (3 x 0.05 deg)^2, and 3 x 5 mm times 3 x 0.05 deg
     assert np.abs(stated - along).max() < 8e-5
@@ -91,8 +91,8 @@ def test_distances_change_as_the_columns_say(path: Path, rows: Rows) -> None:
 
 def test_the_normal_matrix_is_that_of_all_columns_together(path: Path, rows: Rows) -> None:
     """The lidar's part for path and lasers: what a change of the residuals by these columns does to the gradient."""
-    rng, lasers = np.random.default_rng(3), rows.lasers
-    assert lasers is not None
+    rng, (lasers,) = np.random.default_rng(3), rows.more
+    assert isinstance(lasers, LaserColumns)
     assert rows.size == rows.path_size + UNKNOWNS
     x = rng.normal(size=rows.size)
     coefficients = x[: rows.path_size].reshape(-1, 6)
@@ -106,7 +106,7 @@ def test_the_normal_matrix_is_that_of_all_columns_together(path: Path, rows: Row
     y = rng.normal(size=rows.size)
     assert x @ rows.apply(y) == pytest.approx(y @ rows.apply(x), rel=1e-6)
     # without lasers nothing changes for the path
-    alone = replace(rows, lasers=None)
+    alone = replace(rows, more=[], border=np.zeros((0, 0)), corner=np.zeros((0, 0)))
     np.testing.assert_allclose(
         alone.apply(x[: rows.path_size]), rows.apply(np.append(x[: rows.path_size], np.zeros(UNKNOWNS)))[: rows.path_size]
     )  # fmt: skip
@@ -120,8 +120,7 @@ def test_offsets_of_a_sensor_are_found_within_their_sigma(path: Path) -> None:
     found = np.zeros(UNKNOWNS)
     for _ in range(3):
         rows = rows_of(clusters, path, VOXEL_M, 10**6, cut=False)
-        assert rows.lasers is not None
-        normal = rows.lasers.corner + np.diag(PRIOR**-2)
+        normal = rows.corner + np.diag(PRIOR**-2)
         step = -np.linalg.solve(normal, rows.gradient()[rows.path_size :] + found / PRIOR**2)
         found += step
         clusters.xyz_m = shifted(clusters.xyz_m, clusters.laser, step)

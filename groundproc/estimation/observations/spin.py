@@ -1,0 +1,195 @@
+"""The line of the spin: what the lidar's own gyro reads at exactly the frequency of its rotor, as unknowns of the adjustment.
+
+Where that gyro carries the motion between two knots, the line is in the path: a degree per second at 10 Hz turns it by 16 mdeg to and fro.
+The turn over a slice of one revolution does not show it, and no spline with a knot a revolution follows it. So the path is turned, about
+each axis of the sensor, by a sine and a cosine of the rotor's azimuth. These six are unknowns by which the lidar's rows are linear. In
+surfaces that stand at one azimuth all the time they leave no residual; turns of the vehicle show them.
+
+The gyro itself tells the line's size and phase well. What it cannot tell is whether it is wrong there, or whether the head of the sensor
+does shake so. The share of it that is wrong is one more unknown, which the surfaces have to tell.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.estimation.observations.rows import Factor, RowBuilder, Unknowns
+from groundproc.estimation.odometry.clusters import Clusters
+from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.spline import Path
+
+Array = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+NAME: Final = "lidar.spin"
+SHARE: Final = "lidar.spin_share"
+UNKNOWNS: Final = 6
+PRIOR_RAD_S: Final = np.deg2rad(1.0)
+"""What a gyro reads at the spin's frequency, one sigma of sine and cosine: an HDL-32E on a tripod shows 0.2 to 0.6 deg/s."""
+EITHER: Final = 0.5
+"""Of the line that the gyro reads, this share is its error, and the sigma of that: between none and all."""
+BESIDE_HZ: Final = np.concatenate([-np.arange(0.5, 2.05, 0.15), np.arange(0.5, 2.05, 0.15)])
+"""Beside the spin's frequency, where a gyro reads as much noise and motion."""
+RATES_HZ: Final = np.arange(4.0, 26.0, 0.125)
+"""Spins that are sought; lidars of this kind are specified for 5 to 20 Hz."""
+SOUGHT: Final = 20
+"""Slices on end that the spin is sought in."""
+CLEAR: Final = 0.9
+"""Coherence of azimuth and time below which nothing spins evenly."""
+
+
+@dataclass(slots=True)
+class Spin:
+    """The rotor, and what is known of its line.
+
+    Attributes
+    ----------
+    azimuth_rad : ndarray, shape (n,)
+        Of the rotor on a path's grid, unwrapped.
+    rate_rad_s : float
+        Mean.
+    value_rad : ndarray, shape (6,)
+        What the path has been turned by so far: sine and cosine of x, then of y, then of z.
+    read_rad, read_sigma_rad : ndarray, shape (6,)
+        What it would be, were all of the line that the gyro reads its error; and how well that is told.
+    share : float
+        Of it that is, so far.
+    """
+
+    azimuth_rad: Array
+    rate_rad_s: float
+    value_rad: Array = field(default_factory=lambda: np.zeros(UNKNOWNS))
+    read_rad: Array = field(default_factory=lambda: np.zeros(UNKNOWNS))
+    read_sigma_rad: Array = field(default_factory=lambda: np.full(UNKNOWNS, np.inf))
+    share: float = EITHER
+
+    def unknowns(self, unknowns: Unknowns) -> None:
+        """The six, the gyro's error as the angle that it adds up to; and the share of what the gyro reads."""
+        unknowns.add(NAME, np.full(UNKNOWNS, PRIOR_RAD_S / self.rate_rad_s), self.value_rad, unit="deg")
+        unknowns.add(SHARE, np.array([EITHER]), np.array([self.share]), np.array([EITHER]))
+
+    def read(self, rates_rad_s: Sequence[tuple[Array, Flags]]) -> None:
+        """Find the line in readings on the grid's steps, shape (n, 3), with which of them are known: in those that tell it best."""
+        for rate, known in rates_rad_s:
+            line, sigma = _demodulated(rate, known, self.azimuth_rad)
+            # the turn that undoes what a sine and a cosine of the rate add up to
+            found = np.stack([-line[1], line[0]], axis=1).ravel() / self.rate_rad_s
+            if sigma.sum() / self.rate_rad_s < self.read_sigma_rad[::2].sum():
+                self.read_rad, self.read_sigma_rad = found, np.repeat(sigma, 2) / self.rate_rad_s
+
+    def factors(self, unknowns: Unknowns) -> list[Factor]:
+        """The line is a share of the one that was read."""
+        if not np.isfinite(self.read_sigma_rad).all():
+            return []
+        builder = RowBuilder(UNKNOWNS, unknowns)
+        builder.by(np.zeros(1, np.int64), NAME, np.eye(UNKNOWNS)[None])
+        builder.by(np.zeros(1, np.int64), SHARE, -self.read_rad[None, :, None])
+        residual = self.value_rad - self.share * self.read_rad
+        return [Factor("spin line", residual, builder.matrix(), self.read_sigma_rad)]
+
+    def take(self, part: Mapping[str, Array]) -> None:
+        """Put a solution in."""
+        self.value_rad = self.value_rad + part[NAME]
+        self.share += float(part[SHARE][0])
+
+    def turns(self, value_rad: Array, every: int = 1) -> Array:
+        """Rotation vectors in the body on every so manieth pose of the grid, shape (m, 3)."""
+        azimuth = self.azimuth_rad[::every, None]
+        return np.asarray(np.sin(azimuth) * value_rad[0::2] + np.cos(azimuth) * value_rad[1::2])
+
+    def at_knots(self) -> Array:
+        """What the path has been turned by at its knots, shape (intervals + 1, 3)."""
+        return self.turns(self.value_rad, STEPS)
+
+
+@dataclass(slots=True)
+class SpinColumns:
+    """The lidar's rows by the six unknowns.
+
+    Attributes
+    ----------
+    turning : ndarray of float32, shape (n, 3)
+        Rows by a turn in the body [m/rad].
+    circle : ndarray of float32, shape (n, 2)
+        Sine and cosine of the azimuth of each row's cluster.
+    """
+
+    UNKNOWNS: ClassVar[int] = UNKNOWNS
+
+    turning: Singles
+    circle: Singles
+
+    def column(self, number: int) -> Array:
+        """The rows by one unknown, shape (n,)."""
+        axis, part = divmod(number, 2)
+        return self.turning[:, axis].astype(np.float64) * self.circle[:, part]
+
+    def along(self, value: Array) -> Array:
+        """The rows times the unknowns, shape (6,): shape (n,)."""
+        turn = np.einsum("nk,ak->na", self.circle, value.reshape(3, 2))
+        return np.asarray(np.einsum("na,na->n", self.turning, turn))
+
+    def gradient(self, projected: Array) -> Array:
+        """Columns times weighed values less their planes, shape (n,): shape (6,)."""
+        return np.array([self.column(number) @ projected for number in range(UNKNOWNS)])
+
+
+def spin_columns(jacobian: Singles, xyz_m: Singles) -> SpinColumns:
+    """Columns of rows, by their turns in the body, and their clusters in the sensor frame."""
+    reach = np.maximum(np.hypot(xyz_m[:, 0], xyz_m[:, 1]), 1e-6)[:, None]
+    return SpinColumns(jacobian[:, :3], (xyz_m[:, :2] / reach).astype(np.float32))
+
+
+def spin_of(clusters: Clusters, path: Path) -> Spin | None:
+    """The rotor of a lidar all of whose lasers look along one azimuth; None where nothing turns evenly."""
+    if not len(clusters):
+        return None
+    since_s = np.asarray((clusters.time_ns - path.start_ns) * 1e-9, np.float64)
+    azimuth = np.arctan2(*clusters.xyz_m[:, :2].astype(np.float64).T)
+    slot = np.clip((clusters.time_ns - path.start_ns) // (STEPS * path.step_ns), 0, path.intervals - 1)
+    rate = _sought(since_s, azimuth, slot)
+    if rate is None:
+        return None
+    off = azimuth - rate * since_s
+    east, north, count = (
+        np.bincount(slot, each, path.intervals) for each in (np.sin(off), np.cos(off), np.ones(len(off)))
+    )
+    seen = np.flatnonzero(count)
+    if np.hypot(east, north)[seen].sum() < CLEAR * count.sum():
+        return None
+    phase = np.unwrap(np.arctan2(east[seen], north[seen]))
+    grid = np.arange(len(path.quat))
+    whole = rate * grid * path.step_ns * 1e-9 + np.interp(grid, (seen + 0.5) * STEPS, phase)
+    return Spin(whole, float((whole[-1] - whole[0]) / (len(grid) - 1) / (path.step_ns * 1e-9)))
+
+
+def _demodulated(rate: Array, known: Flags, azimuth: Array) -> tuple[Array, Array]:
+    """Sine and cosine of the azimuth in readings, shape (2, 3), and their sigma, shape (3,), by what is beside that frequency."""
+    count = min(len(rate), len(azimuth) - 1)
+    weight = np.hanning(count) * known[:count]
+    total = weight.sum()
+    if total < 1.0:
+        return np.zeros((2, 3)), np.full(3, np.inf)
+    middle = 0.5 * (azimuth[1 : count + 1] + azimuth[:count])
+    level = rate[:count] - (weight @ rate[:count]) / total
+    time_s = np.arange(count) * STEP_NS * 1e-9
+    line = 2.0 / total * (weight * np.exp(-1j * middle)) @ level
+    beside = np.exp(-2j * np.pi * BESIDE_HZ[:, None] * time_s)
+    noise = 2.0 / total * (beside * (weight * np.exp(-1j * middle))) @ level
+    return np.stack([-line.imag, line.real]), np.sqrt(np.mean(np.abs(noise) ** 2, axis=0) / 2.0)
+
+
+def _sought(since_s: Array, azimuth: Array, slot: Ints) -> float | None:
+    """Rate of the rotor [rad/s] in some slices on end: that by which azimuths and times go together best."""
+    first = int(np.bincount(slot).argmax())
+    some = np.flatnonzero((slot >= first) & (slot < first + SOUGHT))
+    some = some[:: max(len(some) // 4000, 1)]
+    rates = 2.0 * np.pi * RATES_HZ
+    together = np.abs(np.exp(1j * (azimuth[some] - rates[:, None] * since_s[some])).sum(axis=1))
+    best = int(together.argmax())
+    return float(rates[best]) if together[best] > 0.5 * len(some) else None
