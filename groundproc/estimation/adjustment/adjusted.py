@@ -1,6 +1,8 @@
 """Method `adjusted`: the whole flight in one adjustment of lidar, inertial sensors, GNSS and compass.
 
-packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass; and the sigma of each.
+packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass; and the sigma of each. And the packets
+once more
+--fine--> the motion between the knots.
 """
 
 import functools
@@ -15,8 +17,9 @@ from flightlog import frames
 from flightlog.errors import LogError
 from groundproc.estimation.adjustment.causal import CausalRun, causal_run
 from groundproc.estimation.adjustment.figures import Figures, odometry_figures, outcome_figures, stated_figures
+from groundproc.estimation.adjustment.fine import refined
 from groundproc.estimation.adjustment.joining import joining
-from groundproc.estimation.adjustment.pace import Pace
+from groundproc.estimation.adjustment.pace import Pace, Part
 from groundproc.estimation.adjustment.run import Run
 from groundproc.estimation.adjustment.windows import (
     OVERLAP,
@@ -50,6 +53,8 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 
 Array = npt.NDArray[np.float64]
 
+REFINING: Final = 0.2
+"""Part of the work that is done while the log is read for the second time."""
 LEAST_LASERS: Final = 8
 """Of a lidar whose motion the adjustment can tell from its returns."""
 
@@ -80,7 +85,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     start = begun.trajectory
     made: list[Run | CausalRun] = []
     reasons: list[LogError] = []
-    adjust = causal_run if given.survey.causal else functools.partial(adjust_run, more=more)
+    adjust = causal_run if given.survey.causal else functools.partial(whole_run, more=more)
     for number in sorted({leg.run for leg in given.placed}):
         legs = [leg for leg in given.placed if leg.run == number]
         try:
@@ -162,6 +167,27 @@ def on_fixes(part: Trajectory, given: Given) -> Trajectory:
         total += (off / fixes.sigma_m[known] ** 2).sum(axis=0)
         weight += (fixes.sigma_m[known] ** -2).sum(axis=0)
     return replace(part, position_m=part.position_m + total / weight) if weight.all() else part
+
+
+def whole_run(
+    given: Given,
+    legs: Sequence[Leg],
+    number: int,
+    start: Trajectory,
+    progress: Progress,
+    more: Sequence[Observation] = (),
+) -> Run:
+    """Adjust one run of the lidar's clock, and stream it once more for its motion between the knots (`fine`)."""
+    part = Part(progress, 1.0 - REFINING)
+    run = adjust_run(given, legs, number, start, part, more=more)
+    if run.is_worse():
+        part.rest("adjust")
+        return run
+    corrected = replace(given, corrections=run.lasers(given.corrections, len(given.lidar.lasers)))
+    pieces = slices(corrected, run.motion.start_ns, Part(progress, REFINING))
+    density = float(np.mean([window.density for window in run.windows]))
+    run.path = refined(run.path, pieces, run.motion.start_ns, density, run.track.voxel_m)
+    return run
 
 
 def adjust_run(

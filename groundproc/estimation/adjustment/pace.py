@@ -40,3 +40,28 @@ class Pace:
     def _pay(self, done: int) -> None:
         self._owed -= done
         self._progress("adjust", done)
+
+
+class Part:
+    """Tells a share of the progress of a part of the work, so that both parts together tell all of it.
+
+    Parameters
+    ----------
+    progress : callable
+    share : float
+    """
+
+    def __init__(self, progress: Progress, share: float) -> None:
+        self._progress, self._share = progress, share
+        self._all, self._told = 0, 0
+
+    def __call__(self, stage: str, done: int) -> None:
+        """So many bytes more are through it."""
+        self._all += done
+        now = round(self._share * self._all) - self._told
+        self._told += now
+        self._progress(stage, now)
+
+    def rest(self, stage: str) -> None:
+        """The other part is not done: what it would have told."""
+        self._progress(stage, self._all - self._told)

@@ -18,7 +18,7 @@ from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, pa
 from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
 from groundproc.estimation.observations import lasers
-from groundproc.estimation.observations.inertial import gyro_readings
+from groundproc.estimation.observations.inertial import carried_density, gyro_readings
 from groundproc.estimation.observations.lidar import Lidar
 from groundproc.estimation.observations.observation import Observation, Stretch
 from groundproc.estimation.observations.rows import H, Unknowns
@@ -111,6 +111,8 @@ class Window:
         the others are what they do not know of themselves.
     correlation : ndarray, shape (slices + 1, 6, 6)
         Of the errors of position and attitude.
+    density : float
+        Noise of the turns of the gyro that carries the motion, as learnt [rad/sqrt(s)].
     """
 
     first: int
@@ -127,6 +129,7 @@ class Window:
     told: dict[str, Any] = field(default_factory=dict)
     seen: "Seen | None" = None
     correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
+    density: float = 0.0
 
 
 @dataclass(slots=True)
@@ -190,6 +193,7 @@ def adjust_window(
     return Window(
         first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
         batch.log, exact, corrections, batch.said(), seen, errors.correlation,
+        carried_density(observations, motion.rate_density),
     )  # fmt: skip
 
 

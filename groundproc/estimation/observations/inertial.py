@@ -10,7 +10,7 @@ import numpy.typing as npt
 from flightlog import frames
 from groundproc.estimation.observations import accelerometer, gyro
 from groundproc.estimation.observations.observation import Flown, Observation, State, Stretch
-from groundproc.estimation.observations.rows import Carrying, Factor, Unknowns, turned
+from groundproc.estimation.observations.rows import Carrying, Factor, H, Unknowns, turned
 from groundproc.estimation.observations.unit import Unit, make_unit, place_on_grid, robust_sigma
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.motion import ImuTrack
@@ -124,6 +124,14 @@ def gyro_readings(observations: Sequence[Observation]) -> list[tuple[Array, npt.
         others = (each.unit for each in units if not each.carries and each.unit is not None)
         found += [(own.rate_rad_s - other.rate_rad_s, own.known & other.known) for other in others]
     return found
+
+
+def carried_density(observations: Sequence[Observation], otherwise: float) -> float:
+    """Noise of the turns of the gyro that carries the motion, as a window has learnt it [rad/sqrt(s)]."""
+    units = (
+        each.unit for each in observations if isinstance(each, Inertial) and each.carries and each.unit is not None
+    )
+    return next((float(unit.sigma_turn_rad / np.sqrt(H)) for unit in units), otherwise)
 
 
 def of_run(flown: Flown) -> list[Observation]:
