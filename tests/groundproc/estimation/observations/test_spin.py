@@ -30,7 +30,7 @@ def flown() -> Path:
 
 
 def room(path: Path, count: int = 30_000) -> Clusters:
-    """What a spinning lidar sees of six walls, 10 m away, with a path's poses; 5 mm of noise."""
+    """What a spinning lidar sees of six walls, 9.7 m away, with a path's poses; 5 mm of noise."""
     rng = np.random.default_rng(1)
     step = np.sort(rng.integers(0, len(path.quat) - 1, count))
     azimuth = FIRST + RATE * step * STEP_NS * 1e-9
@@ -38,7 +38,7 @@ def room(path: Path, count: int = 30_000) -> Clusters:
     flat = np.cos(elevation)
     ray = np.stack([np.sin(azimuth) * flat, np.cos(azimuth) * flat, np.sin(elevation)], axis=1)
     out = np.einsum("nij,nj->ni", frames.mat_from_quat(path.quat)[step], ray)
-    reach = ((10.0 - np.sign(out) * path.position_m[step]) / np.abs(out)).min(axis=1)
+    reach = ((9.7 - np.sign(out) * path.position_m[step]) / np.abs(out)).min(axis=1)
     xyz = (reach + 0.005 * rng.normal(size=count))[:, None] * ray
     return Clusters(
         START_NS + step * STEP_NS, xyz.astype(np.float32), np.zeros((count, 6), np.float32), np.full(count, 8, np.int32)
