@@ -114,7 +114,7 @@ def losses(quality: Quality) -> Html:
     outside = lidar["packets_outside_every_leg"]
     rows.append(("Lidar packets at times without autopilot", count(outside), _of(outside, packets)))
     rows += [
-        (_ABOARD.get(name, name).capitalize().replace("Lidar", "Lidar"), count(number), _of(number, packets + number))
+        (_ABOARD.get(name, name).capitalize(), count(number), _of(number, packets + number))
         for name, number in lidar["aboard"].items()
     ]
     rows.append(("Bytes of the autopilot that belong to no good message", count(pilot["bad_bytes"]), ""))

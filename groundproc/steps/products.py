@@ -43,7 +43,11 @@ def digests_of(folder: Path) -> dict[str, str]:
     ledger = open_ledger(folder)
     if ledger is None:
         return {}
-    found = {Path(log).name: ledger.files[log].digest for log in ledger.logs if log in ledger.files}
+    found: dict[str, str] = {}
+    for log in ledger.logs:
+        if log in ledger.files:  # several may have one name, in folders of their own
+            name = Path(log).name
+            found[name] = ", ".join(filter(None, (found.get(name), ledger.files[log].digest)))
     for unit, entry in ledger.entries.items():
         if unit.partition(BETWEEN)[0] != STEP.name:
             found |= {name: mark.digest for name, mark in entry.outputs.items() if not name.startswith(INSIDE)}

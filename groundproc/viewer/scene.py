@@ -7,10 +7,12 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 
+from flightlog.errors import GeodesyError
 from groundproc.viewer.shades import Shade
 
 Array = npt.NDArray[np.float64]
 
+_SIGNS: Final = {"metre": "m", "foot": "ft", "US survey foot": "US ft"}
 _HEIGHTS: Final = (1.0, 99.0)
 """Percentiles between which the colours of heights span at first."""
 _CORE: Final = (0.5, 99.5)
@@ -20,6 +22,23 @@ _CORE: Final = (0.5, 99.5)
 def origin_of(low_m: Array, high_m: Array) -> Array:
     """A round place in the middle, shape (3,), so that coordinates from there keep their millimetres in single precision."""
     return np.asarray(np.floor((low_m + high_m) / 20.0) * 10.0)
+
+
+def units_of(crs: pyproj.CRS | None) -> tuple[str, str]:
+    """Units of coordinates in plan and of heights, as signs; "units" where the file does not say.
+
+    Raises
+    ------
+    GeodesyError
+        The coordinates are angles, in which nothing can be measured.
+    """
+    if crs is None:
+        return "units", "units"
+    names = [axis.unit_name for axis in crs.axis_info]
+    if crs.is_geographic or any("degree" in name for name in names[:2]):
+        raise GeodesyError(f"coordinates in {crs.name} are angles, expected a projected CRS")
+    signs = [_SIGNS.get(name, name) for name in names]
+    return signs[0], signs[2] if len(signs) > 2 else signs[0]
 
 
 def scene(
@@ -46,6 +65,11 @@ def scene(
     spacing_m : float
         Between points: their size.
     crs : pyproj.CRS, optional
+
+    Raises
+    ------
+    GeodesyError
+        The coordinates are angles.
     """
     low, high = np.percentile(sample_m[:, 2], _HEIGHTS)
     core = np.percentile(sample_m, _CORE, axis=0) - origin_m
@@ -59,6 +83,7 @@ def scene(
         "paths": [[_rounded(place) for place in path - origin_m] for path in paths],
         "spacing": round(spacing_m, 4),
         "crs": "" if crs is None else crs.name,
+        "units": list(units_of(crs)),
     }
 
 

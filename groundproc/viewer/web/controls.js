@@ -69,11 +69,11 @@ function drawResults(viewer) {
     if (points.length < 2) continue;
     if (kind === "distance") {
       const {whole, plan} = lengthOf(points);
-      rows.push(make("h4", {textContent: "Distance"}), table([["in space", metres(whole)], ["in plan", metres(plan)],
-        ["height difference", (points.at(-1)[2] >= points[0][2] ? "+" : "−") + metres(Math.abs(points.at(-1)[2] - points[0][2]))]]));
+      rows.push(make("h4", {textContent: "Distance"}), table([["in space", UNIT.plan === UNIT.height ? metres(whole) : "–"], ["in plan", metres(plan)],
+        ["height difference", (points.at(-1)[2] >= points[0][2] ? "+" : "−") + metres(Math.abs(points.at(-1)[2] - points[0][2]), UNIT.height)]]));
     } else if (points.length > 2) {
       const {plan, own, round} = areaOf(points);
-      rows.push(make("h4", {textContent: "Area"}), table([["in plan", number(plan, 2) + " m²"], ["along its plane", number(own, 2) + " m²"], ["around it", metres(round)]]));
+      rows.push(make("h4", {textContent: "Area"}), table([["in plan", metres(plan) + "²"], ["along its plane", UNIT.plan === UNIT.height ? metres(own) + "²" : "–"], ["around it", UNIT.plan === UNIT.height ? metres(round) : "–"]]));
     }
   }
   if (viewer.picked) rows.push(make("h4", {textContent: "Point"}), table(viewer.told(viewer.picked)));
@@ -109,8 +109,8 @@ function drawOverlay(viewer, view) {
     const places = points.map(p => onScreen(view, p));
     line(places, viewer.paper, 5, kind === "area" && places.length > 2); line(places, "#ff8a3d", 2.5, kind === "area" && places.length > 2);
     places.forEach(p => dot(p, 4.5, "#ff8a3d"));
-    if (kind === "distance") for (let i = 1; i < points.length; i++) label(onScreen(view, points[i].map((v, k) => (v + points[i - 1][k]) / 2)), metres(lengthOf(points.slice(i - 1, i + 1)).whole));
-    if (kind === "area" && points.length > 2) label(onScreen(view, [0, 1, 2].map(k => points.reduce((s, p) => s + p[k], 0) / points.length)), number(areaOf(points).plan, 2) + " m²");
+    if (kind === "distance") for (let i = 1; i < points.length; i++) label(onScreen(view, points[i].map((v, k) => (v + points[i - 1][k]) / 2)), metres(lengthOf(points.slice(i - 1, i + 1))[UNIT.plan === UNIT.height ? "whole" : "plan"]));
+    if (kind === "area" && points.length > 2) label(onScreen(view, [0, 1, 2].map(k => points.reduce((s, p) => s + p[k], 0) / points.length)), metres(areaOf(points).plan) + "²");
   }
   if (viewer.picked) dot(onScreen(view, viewer.placeOf(viewer.picked)), 5, viewer.accent);
   if (viewer.loop) { paint.fillStyle = viewer.accent + "33"; paint.beginPath(); viewer.loop.forEach((p, i) => i ? paint.lineTo(...p) : paint.moveTo(...p)); paint.fill("evenodd"); line(viewer.loop, viewer.accent, 2, true, [6, 4]); }
@@ -121,8 +121,8 @@ function drawOverlay(viewer, view) {
     paint.font = "12px system-ui, sans-serif"; paint.textAlign = "right"; paint.lineWidth = 3; paint.strokeStyle = viewer.paper;
     paint.strokeText(text, x, y - up); paint.fillStyle = viewer.ink; paint.fillText(text, x, y - up);
   };
-  line(ruler, viewer.paper, 4); line(ruler, viewer.ink, 1.5); words(long + " m", 9);
-  if (viewer.slab) return words("heights to the same scale", 26);
+  line(ruler, viewer.paper, 4); line(ruler, viewer.ink, 1.5); words(long + " " + UNIT.plan, 9);
+  if (viewer.slab) return words(UNIT.plan === UNIT.height ? "heights to the same scale" : "heights in " + UNIT.height, 26);
   // north arrow, as it lies on the ground
   const up = onScreen(view, camera.centre), north = onScreen(view, [camera.centre[0], camera.centre[1] + 30 * view.perPixel, camera.centre[2]]);
   if (up && north) {

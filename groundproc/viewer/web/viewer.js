@@ -1,5 +1,6 @@
 // The viewer: a scene, its controls, its tools. Scene: {origin, low, high, total, spacing, shades, crs, paths, start}.
 const HEIGHT = {name: "z", label: "height", unit: "m", kinds: [], low: 0, step: 1};
+const UNIT = {plan: "m", height: "m"};  // of the scene's CRS
 const make = (tag, options = {}, ...inside) => {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(options)) {
@@ -10,17 +11,18 @@ const make = (tag, options = {}, ...inside) => {
   return made;
 };
 const number = (value, digits) => value.toLocaleString("en", {minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false});
-const metres = value => number(value, 2) + " m";
+const metres = (value, unit = UNIT.plan) => number(value, 2) + " " + unit;
 class Viewer {
   constructor(place, scene) {
     Object.assign(this, {place, scene, mode: "look", taken: [], measured: [], hidden: new Set(), slab: null, slow: false, dirty: true, moving: 0});
+    [UNIT.plan, UNIT.height] = scene.units;
     this.canvas = make("canvas", {tabIndex: 0, className: "cloud", ariaLabel: "point cloud in three dimensions"});
     this.overlay = make("canvas", {className: "overlay"});
     place.append(this.canvas, this.overlay);
     this.renderer = new Renderer(this.canvas);
     this.camera = new Camera(...scene.core);
     this.look = {size: 1, dome: true, grain: scene.spacing || 0.1};
-    this.shades = [{...HEIGHT, shown: scene.heights, low: scene.low[2], step: (scene.high[2] - scene.low[2]) / 254 || 1}, ...scene.shades];
+    this.shades = [{...HEIGHT, unit: UNIT.height, shown: scene.heights, low: scene.low[2], step: (scene.high[2] - scene.low[2]) / 254 || 1}, ...scene.shades];
     if (["red", "green", "blue"].every(name => scene.shades.some(each => each.name === name)))
       this.shades.push({name: "rgb", label: "colour", unit: "", kinds: [], shown: [0, 1]});
     steer(this.canvas, this.camera, {
@@ -62,7 +64,12 @@ class Viewer {
     // while it moves, a slow machine draws every fourth point
     this.coarse = this.slow && !quiet;
     this.drawn = this.renderer.draw(view, {...this.look, slab: this.slab, palette: this.fresh()}, this.coarse ? chunk => chunk.first : null);
-    if (this.coarse === false) { this.renderer.gl.readPixels(0, 0, 1, 1, this.renderer.gl.RGBA, this.renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); this.slow = performance.now() - began > 60; }
+    if (!this.coarse) {  // the answer comes when it is drawn
+      const gl = this.renderer.gl;
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+      this.slow = performance.now() - began > 60;
+      if (this.drawn && !this.shownAt) this.shownAt = performance.now();
+    }
     drawOverlay(this, view);
     this.frames = (this.frames || 0) + 1;
   }
@@ -90,7 +97,7 @@ class Viewer {
   placeOf({chunk, i}) { return [0, 1, 2].map(axis => chunk.places[3 * i + axis]); }
   // What is known of a point, in the words of the table.
   told({chunk, i}) {
-    const place = this.placeOf({chunk, i}), rows = ["easting", "northing", "height"].map((name, axis) => [name, number(place[axis] + this.scene.origin[axis], 3) + " m"]);
+    const place = this.placeOf({chunk, i}), rows = ["easting", "northing", "height"].map((name, axis) => [name, number(place[axis] + this.scene.origin[axis], 3) + " " + (axis < 2 ? UNIT.plan : UNIT.height)]);
     for (const shade of this.scene.shades) {
       const byte = chunk.bytes[shade.name] && chunk.bytes[shade.name][i];
       if (byte === undefined) continue;
