@@ -27,6 +27,8 @@ _STOPS: Final = {
     "sides": ("2166ac", "92c5de", "f2f2f0", "f4a582", "b2182b"),
 }
 _FIRST: Final = ("dsm.tif", "density.tif", "intensity.tif")
+_UNITS: Final = {"metre": "", "1/m2": "/m²"}
+"""GDAL says "metre", of the heights of the CRS, where a band states no unit."""
 SHADE: Final = "hillshade.tif"
 _TITLES: Final = {"dsm.tif": "Height", "density.tif": "Density", "intensity.tif": "Intensity", SHADE: "Hillshade"}
 
@@ -78,7 +80,10 @@ def _read(path: Path) -> Layer:
         values, pixel_m = geotiff.coarse(raster, _PIXELS)
         if raster.file.nodata is None:
             values = np.where(values == 0.0, np.nan, values)  # a count: nothing was seen
-        band, unit = raster.file.descriptions[0] or path.stem, raster.file.units[0] or ""
+        band, unit = (
+            raster.file.descriptions[0] or path.stem,
+            _UNITS.get(raster.file.units[0] or "", raster.file.units[0] or ""),
+        )
         title = _TITLES.get(path.name, band[:1].upper() + band[1:])
         return Layer(
             path.name, title, unit, values, raster.west_m, raster.north_m, pixel_m, _colours(path.name, values)
@@ -117,23 +122,21 @@ def _figure(layer: Layer, shade: Layer | None, paths: Sequence[Array]) -> Html:
     rows, columns = layer.values.shape
     low, high = span(layer.values, layer.colours == "sides")
     unit = max(rows, columns) / 100.0
-    parts = [tag("image", href=picture(layer.values, layer.colours, low, high), width=columns, height=rows)]
-    if shade is not None:
-        parts.append(_under(layer, shade))
+    colours = coloured(layer.values, layer.colours, low, high)
+    if shade is not None and shade.values.shape == layer.values.shape:
+        colours = lit(colours, shade.values)
+    parts = [tag("image", href=png(colours), width=columns, height=rows)]
     for path in paths:
         words = "".join(
             f"{'L' if i else 'M'}{(x - layer.west_m) / layer.pixel_m:.1f} {(layer.north_m - y) / layer.pixel_m:.1f}"
             for i, (x, y, *_) in enumerate(path.tolist())
         )
-        parts += [
-            tag("path", d=words, class_="halo", stroke_width=0.9 * unit),
-            tag("path", d=words, class_="track", stroke_width=0.4 * unit),
-        ]
+        parts += [_stroke(words, "#ffffff", 0.9 * unit), _stroke(words, "#d3264f", 0.4 * unit)]
     parts += [_north(columns, unit), *_scale(layer, unit)]
     drawn = tag(
         "svg", parts, viewBox=f"0 0 {columns} {rows}", role="img", aria_label=f"map: {layer.title}", class_="map"
     )
-    bar = picture(np.linspace(0.0, 1.0, 256, dtype=np.float32)[None], layer.colours, 0.0, 1.0)
+    bar = png(coloured(np.linspace(0.0, 1.0, 256, dtype=np.float32)[None], layer.colours, 0.0, 1.0))
     ends = tag(
         "figcaption",
         tag("span", _value(low)),
@@ -143,29 +146,35 @@ def _figure(layer: Layer, shade: Layer | None, paths: Sequence[Array]) -> Html:
     return tag("figure", tag("h3", layer.title), drawn, ends, data_layer=layer.name)
 
 
-def _under(layer: Layer, shade: Layer) -> Html:
-    """The shaded relief as a picture that darkens the one below it."""
-    ratio = shade.pixel_m / layer.pixel_m
-    rows, columns = shade.values.shape
-    values = shade.values
-    if values.shape == layer.values.shape:  # shading bridges small gaps, in which there is no height to lie under it
-        values = np.where(np.isnan(layer.values), np.nan, values)
+def _stroke(words: str, colour: str, width: float) -> Html:
     return tag(
-        "image", href=picture(values, "grey", -110.0, 255.0), class_="shade", width=round(columns * ratio, 2),
-        height=round(rows * ratio, 2), x=round((shade.west_m - layer.west_m) / layer.pixel_m, 2),
-        y=round((layer.north_m - shade.north_m) / layer.pixel_m, 2), preserveAspectRatio="none",
-    )  # fmt: skip
+        "path",
+        d=words,
+        fill="none",
+        stroke=colour,
+        stroke_width=round(width, 2),
+        stroke_linecap="round",
+        stroke_linejoin="round",
+    )
+
+
+def _label(text: str, y: float = 0.0) -> Iterator[Html]:
+    """Dark on a light edge: read on any map."""
+    looks: dict[str, str | float | None] = {
+        "y": y,
+        "font_size": "2.6",
+        "font_family": "sans-serif",
+        "font_weight": "bold",
+        "text_anchor": "middle",
+    }
+    yield tag("text", text, fill="none", stroke="#ffffff", stroke_width=0.7, stroke_linejoin="round", **looks)
+    yield tag("text", text, fill="#10161c", **looks)
 
 
 def _north(columns: int, unit: float) -> Html:
-    arrow = tag("path", d="M0 -4L1.8 3L0 1.6L-1.8 3Z", class_="ink")
-    letter = tag("text", "N", y=6.6, class_="middle")
+    arrow = tag("path", d="M0 -4L1.8 3L0 1.6L-1.8 3Z", fill="#10161c", stroke="#ffffff", stroke_width=0.4)
     return tag(
-        "g",
-        arrow,
-        letter,
-        transform=f"translate({columns - 5 * unit:.1f} {6 * unit:.1f}) scale({unit:.3f})",
-        class_="north",
+        "g", arrow, _label("N", 6.6), transform=f"translate({columns - 5 * unit:.1f} {6 * unit:.1f}) scale({unit:.3f})"
     )
 
 
@@ -174,10 +183,11 @@ def _scale(layer: Layer, unit: float) -> Iterator[Html]:
     long_m = scale_m(columns * layer.pixel_m)
     wide, x, y = long_m / layer.pixel_m, 3.0 * unit, rows - 3.0 * unit
     line = f"M{x:.1f} {y - 1.2 * unit:.1f}v{1.2 * unit:.1f}h{wide:.1f}v{-1.2 * unit:.1f}"
-    yield tag("path", d=line, class_="halo", stroke_width=1.1 * unit)
-    yield tag("path", d=line, class_="ruler", stroke_width=0.45 * unit)
-    place = f"translate({x + wide / 2:.1f} {y - 2.2 * unit:.1f}) scale({unit:.3f})"
-    yield tag("g", tag("text", f"{long_m:g} m", class_="middle"), transform=place, class_="north")
+    yield _stroke(line, "#ffffff", 1.1 * unit)
+    yield _stroke(line, "#10161c", 0.45 * unit)
+    yield tag(
+        "g", _label(f"{long_m:g} m"), transform=f"translate({x + wide / 2:.1f} {y - 2.2 * unit:.1f}) scale({unit:.3f})"
+    )
 
 
 def scale_m(width_m: float) -> float:
@@ -198,17 +208,37 @@ def span(values: Values, both: bool = False) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
-def picture(values: Values, colours: str, low: float, high: float) -> str:
-    """A PNG of one byte a pixel, as a data URI; what has no value is transparent."""
-    from PIL import Image
-
+def coloured(values: Values, colours: str, low: float, high: float) -> npt.NDArray[np.uint8]:
+    """Colours, shape (rows, columns, 4); what has no value is transparent."""
     known = np.isfinite(values)
     steps = np.clip((np.where(known, values, low) - low) / (high - low), 0.0, 1.0)
-    bytes_ = np.where(known, 1 + np.rint(steps * 254), 0).astype(np.uint8)
-    image = Image.fromarray(bytes_, "P")
-    image.putpalette([0, 0, 0, *palette(colours).ravel().tolist()])
+    out = np.zeros((*values.shape, 4), np.uint8)
+    out[..., :3] = palette(colours)[np.rint(steps * 254).astype(int)] * known[..., None]
+    out[..., 3] = 255 * known
+    return out
+
+
+def lit(colours: npt.NDArray[np.uint8], shade: Values) -> npt.NDArray[np.uint8]:
+    """Colours of a surface in the light of a shaded relief, 1 to 255 of the same cells; flat ground keeps its own."""
+    out = colours.copy()
+    light = 0.3 + 0.99 * np.where(np.isfinite(shade), shade, 180.0) / 255.0
+    out[..., :3] = np.clip(colours[..., :3] * light[..., None], 0.0, 255.0)
+    return out
+
+
+def png(colours: npt.NDArray[np.uint8]) -> str:
+    """A picture as a data URI; one byte a pixel where its colours are few."""
+    from PIL import Image
+
     held = io.BytesIO()
-    image.save(held, "PNG", transparency=0, optimize=True)
+    found, number = np.unique(colours.reshape(-1, 4).view("<u4")[:, 0], return_inverse=True)
+    if len(found) > 256:
+        Image.fromarray(colours, "RGBA").save(held, "PNG", optimize=True)
+    else:
+        known = found.view(np.uint8).reshape(-1, 4)
+        image = Image.fromarray(number.reshape(colours.shape[:2]).astype(np.uint8), "P")
+        image.putpalette(known[:, :3].ravel().tolist())
+        image.save(held, "PNG", optimize=True, transparency=known[:, 3].tobytes())
     return "data:image/png;base64," + base64.b64encode(held.getvalue()).decode()
 
 

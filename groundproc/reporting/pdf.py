@@ -69,7 +69,7 @@ def _by_weasyprint(page: Path, out: Path) -> None:
         from weasyprint import HTML
     except (ImportError, OSError):  # its libraries may be missing too
         raise UsageError(
-            f"{out.name}: to print the report, Chromium (`apt-get install chromium`) or weasyprint (`pip install weasyprint`) is "
+            f"{out.name}: to print the report, Chromium (`apt-get install chromium`) or weasyprint (`pip install 'swath[pdf]'`) is "
             "needed, and neither is here; any browser prints report.html as well"
         ) from None
     HTML(filename=str(page)).write_pdf(str(out))

@@ -20,7 +20,9 @@ _TOP: Final = 10.0
 _BOTTOM: Final = 38.0
 _COLUMNS: Final = 600
 """Beyond so many points, only the least and the largest of a column are drawn."""
-_COLOURS: Final = 4
+_COLOURS: Final = ("#1769c2", "#c2571a", "#2b8a57", "#8a4fb8")
+"""Where the page's own, which go by light and dark, are not looked at: attributes yield to its style."""
+_TEXT: Final = {"font_size": "11", "font_family": "sans-serif", "fill": "#4c5763"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,7 @@ def draw(plot: Plot) -> Html:
     label = f"{plot.title}: {plot.y_label} over {plot.x_label}"
     picture = tag("svg", parts, viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}", role="img", aria_label=label, class_="plot")
     names = [
-        tag("span", tag("i", class_=f"c{number % _COLOURS}"), curve.name) for number, curve in enumerate(curves)
+        tag("span", tag("i", class_=f"c{number % len(_COLOURS)}"), curve.name) for number, curve in enumerate(curves)
     ] if len(curves) > 1 or curves[0].name else []  # fmt: skip
     caption = tag("figcaption", plot.about) if plot.about else Html("")
     head = tag("div", tag("h3", plot.title), tag("div", names, class_="names"), class_="plothead")
@@ -142,15 +144,48 @@ def _grid(frame: _Frame, plot: Plot) -> list[Html]:
     parts = []
     for value in ticks(frame.low, frame.high, 5):
         y = float(frame.y(np.array(value)))
-        parts.append(tag("line", x1=_LEFT, x2=_WIDTH - _RIGHT, y1=round(y, 1), y2=round(y, 1), class_="grid"))
-        parts.append(tag("text", _short(value), x=_LEFT - 7, y=round(y + 4.0, 1), class_="end"))
+        parts.append(
+            tag("line", x1=_LEFT, x2=_WIDTH - _RIGHT, y1=round(y, 1), y2=round(y, 1), stroke="#d5dbe2", class_="grid")
+        )
+        parts.append(
+            tag("text", _short(value), x=_LEFT - 7, y=round(y + 4.0, 1), class_="end", text_anchor="end", **_TEXT)
+        )
     for value in ticks(frame.left, frame.right, 8):
         x = float(frame.x(np.array(value)))
-        parts.append(tag("text", _short(value), x=round(x, 1), y=_HEIGHT - _BOTTOM + 16, class_="middle"))
-    parts.append(tag("text", plot.x_label, x=(_LEFT + _WIDTH) / 2, y=_HEIGHT - 4, class_="middle label"))
+        parts.append(
+            tag(
+                "text",
+                _short(value),
+                x=round(x, 1),
+                y=_HEIGHT - _BOTTOM + 16,
+                class_="middle",
+                text_anchor="middle",
+                **_TEXT,
+            )
+        )
+    parts.append(
+        tag(
+            "text",
+            plot.x_label,
+            x=(_LEFT + _WIDTH) / 2,
+            y=_HEIGHT - 4,
+            class_="middle label",
+            text_anchor="middle",
+            **_TEXT,
+        )
+    )
     middle = (_TOP + _HEIGHT - _BOTTOM) / 2
     parts.append(
-        tag("text", plot.y_label, x=12.0, y=middle, class_="middle label", transform=f"rotate(-90 12 {middle:g})")
+        tag(
+            "text",
+            plot.y_label,
+            x=12.0,
+            y=middle,
+            class_="middle label",
+            text_anchor="middle",
+            **_TEXT,
+            transform=f"rotate(-90 12 {middle:g})",
+        )
     )
     return parts
 
@@ -161,7 +196,15 @@ def _marks(frame: _Frame, plot: Plot) -> list[Html]:
         left, right = (float(np.clip(frame.x(np.array(each)), _LEFT, _WIDTH - _RIGHT)) for each in (begin, end))
         height = _HEIGHT - _TOP - _BOTTOM
         parts.append(
-            tag("rect", x=round(left, 1), y=_TOP, width=round(max(right - left, 0.5), 1), height=height, class_="mark")
+            tag(
+                "rect",
+                x=round(left, 1),
+                y=_TOP,
+                width=round(max(right - left, 0.5), 1),
+                height=height,
+                fill="#e6eaee",
+                class_="mark",
+            )
         )
     return parts
 
@@ -176,14 +219,22 @@ def _line(frame: _Frame, curve: Curve, number: int) -> Html:
         if drawn:
             words.append(f"{'L' if pen else 'M'}{left:.1f} {top:.1f}")
         pen = drawn
-    return tag("path", d="".join(words), class_=f"line s{number % _COLOURS}")
+    return _stroke("".join(words), "line", number, 1.4)
 
 
 def _dots(frame: _Frame, curve: Curve, number: int) -> Html:
     known = np.isfinite(curve.y)
     x, y = thinned(curve.x[known], curve.y[known])
     words = [f"M{left:.1f} {top:.1f}h0" for left, top in zip(frame.x(x).tolist(), frame.y(y).tolist(), strict=True)]
-    return tag("path", d="".join(words), class_=f"dots s{number % _COLOURS}")
+    return _stroke("".join(words), "dots", number, 3.2)
+
+
+def _stroke(words: str, kind: str, number: int, width: float) -> Html:
+    colour = number % len(_COLOURS)
+    return tag(
+        "path", d=words, fill="none", stroke=_COLOURS[colour], stroke_width=width, stroke_linecap="round", stroke_linejoin="round",
+        class_=f"{kind} s{colour}",
+    )  # fmt: skip
 
 
 def _short(value: float) -> str:

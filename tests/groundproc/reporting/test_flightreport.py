@@ -248,7 +248,7 @@ def test_printing_without_a_printer_is_one_sentence_and_leaves_the_report_as_it_
     monkeypatch.setattr(pdf, "BROWSERS", ("no-such-browser",))
     monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
     assert main(["report", str(folder), "--pdf"]) == 2
-    assert "Chromium (`apt-get install chromium`) or weasyprint" in capsys.readouterr().err
+    assert "Chromium (`apt-get install chromium`) or weasyprint (`pip install 'swath[pdf]'`)" in capsys.readouterr().err
     assert (folder / "report.html").stat().st_mtime_ns == before
     assert not (folder / "report.pdf").exists()
     with pytest.raises(UsageError, match="neither is here"):

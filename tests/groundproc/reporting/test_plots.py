@@ -1,11 +1,14 @@
 """Curves as SVG: what is drawn is where the values are, and nothing of it is lost by thinning."""
 
+import base64
+import io
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from groundproc.reporting.maps import of_points, palette, scale_m, span
+from groundproc.reporting.maps import coloured, lit, of_points, palette, png, scale_m, span
 from groundproc.reporting.plots import Curve, Plot, draw, thinned, ticks
 
 
@@ -61,3 +64,23 @@ def test_a_map_of_points_shows_the_highest_of_a_pixel_north_up() -> None:
     assert np.nanmax(layer.values[: len(layer.values) // 4]) == 3.0
     assert span(layer.values)[0] < span(layer.values)[1]
     assert palette("height").shape == (255, 3)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_picture_has_the_colours_that_it_was_given(many: bool) -> None:
+    values = np.linspace(0.0, 9.0, 60 * 40, dtype=np.float32).reshape(40, 60)
+    values[3, 5] = np.nan
+    colours = coloured(values, "height", 0.0, 9.0)
+    if many:
+        colours = lit(colours, np.random.default_rng(1).uniform(1, 255, (40, 60)).astype(np.float32))
+    data = base64.b64decode(png(colours).removeprefix("data:image/png;base64,"))
+    back = np.asarray(Image.open(io.BytesIO(data)).convert("RGBA"))
+    np.testing.assert_array_equal(back, colours)
+    assert back[3, 5, 3] == 0
+
+
+def test_flat_ground_keeps_its_colour_in_the_light_of_a_relief() -> None:
+    colours = coloured(np.full((2, 2), 4.0, np.float32), "height", 0.0, 9.0)
+    flat = 1.0 + 254.0 * np.cos(np.pi / 4)  # as raster.kinds stores it
+    same = lit(colours, np.full((2, 2), flat, np.float32)).astype(int)
+    assert abs(same[..., :3] - colours[..., :3]).max() <= 2
