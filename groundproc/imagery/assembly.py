@@ -19,7 +19,7 @@ from groundproc.imagery.bundle.block import (
     no_rows,
 )  # fmt: skip
 from groundproc.imagery.bundle.intersection import intersect
-from groundproc.imagery.bundle.screen import GROSS, distances
+from groundproc.imagery.bundle.screen import GROSS, LEAST_ANGLE_RAD, distances
 from groundproc.imagery.bundle.solve import solve
 from groundproc.imagery.measurements import Measurements, rows_of
 from groundproc.imagery.poses import NO_TIME
@@ -32,7 +32,6 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-_LEAST_ANGLE_RAD: Final = np.deg2rad(0.3)
 _LEAST_TO_LAY: Final = 3
 
 
@@ -156,7 +155,7 @@ def assemble(
     places, angle = intersect(block)
     surveyed_too = finite(surveyed)
     places = np.where(surveyed_too[:, None], surveyed, places)
-    bad = ~finite(places) | ((angle < _LEAST_ANGLE_RAD) & ~surveyed_too)
+    bad = ~finite(places) | ((angle < LEAST_ANGLE_RAD) & ~surveyed_too)
     weight = np.where(bad[chosen.point], 0.0, chosen.weight)
     middle = np.nanmean(np.where(bad[:, None], np.nan, places), axis=0) if not bad.all() else np.zeros(3)
     block = replace(

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from flightlog import frames
 from groundproc.files import make_folder, written_aside
 from groundproc.imagery import colmap
+from groundproc.imagery.bundle.block import LIDAR
 from groundproc.imagery.bundle.covariance import CameraPoses, camera_poses, camera_spread, on_map, points_covariance
 from groundproc.imagery.bundle.screen import Adjusted
 from groundproc.imagery.bundle.solve import image_residuals, row_residuals
@@ -22,6 +23,23 @@ from groundproc.imagery.tables import Control, write_points
 Array = npt.NDArray[np.float64]
 
 FILES: Final = ("poses.csv", "rig.yaml", "bundle.json", "points.csv", "residuals.png", "colmap")
+
+
+COMMON_SIGMA_M: Final = 0.015
+"""Of a cloud as a whole, in height: what all of its planes are off together. However many hold a block, it is not known better."""
+
+
+def held_by_cloud_m2(adjusted: Adjusted) -> float:
+    """Variance in height that a block has from the cloud that holds it; 0 where none does."""
+    rows = adjusted.solved.block.rows
+    return COMMON_SIGMA_M**2 if ((rows.source == LIDAR) & (rows.weight > 0.0)).any() else 0.0
+
+
+def place_covariances(adjusted: Adjusted) -> Array:
+    """Covariance of the points in the local frame, shape (p, 3, 3)."""
+    covariance = points_covariance(adjusted.solved.block, adjusted.found, scale_of(adjusted))
+    covariance[:, 2, 2] += held_by_cloud_m2(adjusted)
+    return covariance
 
 
 def rig_after(adjusted: Adjusted) -> Rig:
@@ -45,7 +63,9 @@ def scale_of(adjusted: Adjusted) -> float:
 def local_poses(adjusted: Adjusted) -> CameraPoses:
     """Poses of the cameras in the local frame."""
     solved = adjusted.solved
-    return camera_poses(solved.block, solved.unknowns, adjusted.found.matrix, scale_of(adjusted))
+    poses = camera_poses(solved.block, solved.unknowns, adjusted.found.matrix, scale_of(adjusted))
+    poses.covariance[:, 2, 2] += held_by_cloud_m2(adjusted)
+    return poses
 
 
 def map_poses(adjusted: Adjusted, site: Site, utc_ns: npt.NDArray[np.int64]) -> ImagePoses:
@@ -72,7 +92,7 @@ def write_all(
     measured = block.measured.masked(block.measured.weight > 0.0)
     seen = np.bincount(measured.point, minlength=len(block.points_m))
     good = adjusted.found.normal.kept.determined & (seen > 0)
-    covariance = points_covariance(block, adjusted.found, scale_of(adjusted))[good]
+    covariance = place_covariances(adjusted)[good]
     grid = site.mat_local_grid(block.points_m[good])
     turned = np.swapaxes(grid, 1, 2) @ covariance @ grid
     sigma = np.sqrt(np.maximum(np.diagonal(turned, axis1=1, axis2=2), 0.0))
@@ -124,7 +144,7 @@ def figures(adjusted: Adjusted, site: Site, names: tuple[str, ...], control: Con
         errors = _control(adjusted, site, names, control)
         told["control"] = [one for one, check in errors if not check]
         told["check"] = [one for one, check in errors if check]
-    lidar = (block.rows.source == 1) & (block.rows.weight > 0.0)
+    lidar = (block.rows.source == LIDAR) & (block.rows.weight > 0.0)
     if lidar.any():
         off = row_residuals(block)[lidar]
         told["lidar"] = {"rows": int(lidar.sum()), "rms_m": _number(np.sqrt(np.square(off).mean()))}
@@ -185,7 +205,7 @@ def _control(
     places = {name: number for number, name in enumerate(names)}
     measured = block.measured
     rays = np.bincount(measured.point[measured.weight > 0.0], minlength=len(names))
-    covariance = points_covariance(block, adjusted.found, scale_of(adjusted))
+    covariance = place_covariances(adjusted)
     found = []
     for name, given, check in zip(control.name, control.place_m, control.check.tolist(), strict=True):
         at = places.get(name)

@@ -1,77 +1,32 @@
-"""`swath images` as a whole: what is given is read, put together, adjusted and written."""
+"""`swath images` as a whole: what is given is read, tied together, adjusted and written."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from flightlog.errors import CoverageError, UsageError
-from groundproc.imagery import assembly, results
+from flightlog.errors import CaptureError, UsageError
+from groundproc.imagery import assembly, flown, gate, located, results
+from groundproc.imagery.assembly import Assembled, Known
+from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.screen import Adjusted, adjust
-from groundproc.imagery.imports import load_rig
-from groundproc.imagery.measurements import Measurements, gather, rows_of
-from groundproc.imagery.poses import NO_TIME, ImagePoses, read_poses
-from groundproc.imagery.rig import Rig
-from groundproc.imagery.site import Site, cartesian, georeferenced
-from groundproc.imagery.tables import Control, read_control, read_marks
+from groundproc.imagery.measurements import Measurements, Tracks, gather, rows_of
+from groundproc.imagery.poses import NO_TIME
+from groundproc.imagery.rig import RigCamera
+from groundproc.imagery.session import Progress, Session, Task, begin, known_of, names_listed
+from groundproc.imagery.surface import Surface, held_to, read_surface
+from groundproc.imagery.ties import Features, features_of, match_all, pairs_of
+from groundproc.imagery.tracks import tracks_of
 
 Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Progress = Callable[[str, float], None]
+Mask = npt.NDArray[np.bool_]
 
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """What is asked for.
-
-    Attributes
-    ----------
-    output : Path
-    images : tuple of Path
-        Pictures and folders of them.
-    log, trajectory, rig, cloud, control, image_points, marks, start, times : Path, optional
-    crs : str, optional
-    """
-
-    output: Path
-    images: tuple[Path, ...] = ()
-    log: Path | None = None
-    trajectory: Path | None = None
-    rig: Path | None = None
-    cloud: Path | None = None
-    control: Path | None = None
-    image_points: Path | None = None
-    marks: Path | None = None
-    start: Path | None = None
-    times: Path | None = None
-    crs: str | None = None
-
-
-@dataclass(slots=True)
-class Session:
-    """What is known as the work goes on.
-
-    Attributes
-    ----------
-    names : list of str
-        Images.
-    camera : ndarray of int64
-    utc_ns : ndarray of int64
-    rig : Rig
-    warnings : list of str
-    left_out : dict
-        Images that are not in the block, and why.
-    """
-
-    names: list[str]
-    camera: Ints
-    utc_ns: Ints
-    rig: Rig
-    warnings: list[str] = field(default_factory=list)
-    left_out: dict[str, str] = field(default_factory=dict)
+_SETTLED_S: Final = 5e-5
+"""Shifts of clocks that change less than this need no new poses of the trajectory."""
+_MOST_ROUNDS: Final = 5
+_MOST_RMS_PX: Final = 3.0
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:
@@ -82,105 +37,155 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     SwathError
         What is given cannot be read, or does not make a block.
     """
+    if task.image_points is None and not task.images:
+        raise UsageError("IMAGES are missing; expected some, or --image-points")
+    session = begin(task, progress)
+    known = known_of(session)
+    surface = None if task.cloud is None else read_surface(task.cloud, session.site, lambda n: progress("cloud", n))
+    tracks = None
     if task.image_points is None:
-        raise UsageError("image points: expected --image-points")
-    marks = [read_marks(path) for path in (task.image_points, task.marks) if path is not None]
-    control = None if task.control is None else read_control(task.control)
-    start = None if task.start is None else read_poses(task.start)
-    if task.rig is None:
-        raise UsageError("--rig is missing: image points alone do not say what camera took them")
-    rig = load_rig(task.rig)
-    names = list(dict.fromkeys([*(start.images if start is not None else ()), *marks[0].image]))
-    session = _cameras(rig, names)
-    site = _site(task, start, control)
-    measured = gather(session.names, marks, None)
-    known = _known(session, start, site)
-    made = assembly.assemble(session.rig, session.names, session.camera, known, measured, site, control, ())
-    progress("adjusted", 0.0)
-    adjusted = adjust(
-        made.block, made.block.rig.cameras, measured.matched[made.measured], lambda n, cost: progress("adjusted", n)
+        known, tracks = _tied(session, known, surface, progress)
+    measured = gather(session.names, session.marks, tracks)
+    made = assembly.assemble(
+        session.rig, session.names, session.camera, known, measured, session.site, session.control, ()
     )
-    session.warnings += made.notes
     for name in made.unplaced:
-        session.left_out[name] = "too few points in common with others"
-    return _finish(task, session, site, adjusted, measured, control)
+        session.left_out[name] = "too few points in common with the others"
+    session.warnings += made.notes
+    adjusted, told = _adjusted(session, made, measured, surface, progress)
+    return _finish(task, session, adjusted, measured, told)
 
 
-def _cameras(rig: Rig, names: list[str]) -> Session:
-    """Which camera took which image; images that none took are left out."""
-    numbers = [rig.camera_of(name) for name in names]
-    session = Session(
-        [name for name, number in zip(names, numbers, strict=True) if number is not None],
-        np.array([number for number in numbers if number is not None], np.int64), np.empty(0, np.int64), rig,
-    )  # fmt: skip
-    session.utc_ns = np.full(len(session.names), NO_TIME)
-    for name, number in zip(names, numbers, strict=True):
-        if number is None:
-            session.left_out[name] = "no camera of the rig has a prefix that fits"
-    if not session.names:
-        raise CoverageError(f"none of {len(names)} images fits an image_prefix of the rig, such as {names[0]}")
-    return session
+def _tied(session: Session, known: Known, surface: Surface | None, progress: Progress) -> tuple[Known, Tracks]:
+    """Match all images; those that cannot be read are left out."""
+    features = _features(session, progress)
+    lost = np.array([one is None for one in features])
+    if lost.any():
+        why = {name: session.left_out[name] for name, gone in zip(session.names, lost, strict=True) if gone}
+        session.keep(~lost, "")
+        session.left_out |= why
+        features = [one for one in features if one is not None]
+        known = known_of(session)
+    ground = surface.ground_m if surface is not None else np.nan
+    if surface is None and session.pictures:
+        ground = located.ground_of(session.pictures, known.stations.place_m[known.station])
+    views = located.views_of(known, session.rig, session.camera, float(ground))
+    cameras = [session.rig.cameras[number].camera for number in session.camera]
+    pairs = pairs_of(views, cameras)
+    matches = list(match_all(features, views, pairs, lambda n: progress("matched", n)))
+    if session.trajectory is None and session.start is None:
+        known = located.without_attitudes(known)
+    return known, tracks_of(features, matches)
 
 
-def _site(task: Task, start: ImagePoses | None, control: Control | None) -> Site:
-    """Where the block lies."""
-    places = [given.place_m for given in (control, start) if given is not None]
-    if not places:
-        return cartesian(np.zeros((1, 3)))
-    every = np.concatenate(places)
-    return cartesian(every) if task.crs is None else georeferenced(task.crs, every)
+def _features(session: Session, progress: Progress) -> list[Features | None]:
+    """Features of each image, None where one cannot be read."""
+
+    def work(number: int) -> Features | str:
+        picture = session.pictures[number]
+        try:
+            return features_of(picture.path, session.rig.cameras[session.camera[number]].camera)
+        except CaptureError as error:
+            return str(error).removeprefix(f"{picture.path}: ")
+
+    found: list[Features | None] = []
+    with ThreadPoolExecutor(2) as pool:
+        for number, one in enumerate(pool.map(work, range(len(session.pictures)))):
+            progress("features", 1)
+            if isinstance(one, str):
+                session.left_out[session.names[number]] = one
+            found.append(None if isinstance(one, str) else one)
+    return found
 
 
-def _known(session: Session, start: ImagePoses | None, site: Site) -> assembly.Known:
-    """Poses that are given to begin with."""
-    if start is None:
-        return assembly.unknown_poses(len(session.names), session.camera)
-    rows = rows_of(start.images, session.names)
-    posed = np.array([name in rows for name in session.names])
-    at = np.array([rows.get(name, 0) for name in session.names])
-    place = site.local(start.place_m[at])
-    mat = site.mat_local_grid(place) @ start.mat_grid_camera()[at]
-    session.utc_ns = np.where(posed, start.utc_ns[at], session.utc_ns)
-    return assembly.from_camera_poses(session.rig, session.camera, posed, place, mat)
+def _adjusted(
+    session: Session, made: Assembled, measured: Measurements, surface: Surface | None, progress: Progress
+) -> tuple[Adjusted, dict[str, Any]]:
+    """Adjust in rounds: mounting held, then what held-out views accept of it, with clocks, and the lidar's surface."""
+    matched = measured.matched[made.measured]
+
+    def told(step: int, cost: float) -> None:
+        progress("adjusted", 1)
+
+    known = made.block.rig.cameras
+    adjusted = adjust(made.block, known, matched, told)
+    more: dict[str, Any] = {}
+    block = adjusted.solved.block
+    if session.trajectory is not None:
+        mounting, more["held_out"] = gate.accepted(block, known)
+        block = replace(block, mounting=mounting)
+        adjusted = adjust(_renewed(block), known, matched, told)
+        adjusted = _with_clocks(session, adjusted, known, matched, told)
+    if surface is not None:
+        for _ in range(2):
+            adjusted = adjust(held_to(adjusted.solved.block, surface), known, matched, told)
+        if session.trajectory is not None:
+            adjusted = _with_clocks(session, adjusted, known, matched, told)
+    return adjusted, more
+
+
+def _renewed(block: Block) -> Block:
+    """A block whose wrong matches get another chance, now that more of it is known."""
+    return replace(block, measured=replace(block.measured, weight=np.ones(len(block.measured))))
+
+
+def _with_clocks(
+    session: Session, adjusted: Adjusted, known: tuple[RigCamera, ...], matched: Mask, told: Any
+) -> Adjusted:
+    """Observed poses taken anew where the clocks have moved."""
+    assert session.trajectory is not None
+    before = np.array([one.timeshift_s for one in known])
+    for _ in range(_MOST_ROUNDS):
+        block = adjusted.solved.block
+        now = np.array([one.timeshift_s for one in block.rig.cameras])
+        if np.abs(now - before).max() < _SETTLED_S:
+            break
+        before = now
+        adjusted = adjust(flown.resampled(session.trajectory, block), known, matched, told)
+    return adjusted
 
 
 def _finish(
-    task: Task, session: Session, site: Site, adjusted: Adjusted, measured: Measurements, control: Control | None
+    task: Task, session: Session, adjusted: Adjusted, measured: Measurements, more: dict[str, Any]
 ) -> dict[str, Any]:
     """Write the folder; what bundle.json holds."""
     block = adjusted.solved.block
     rows = rows_of(session.names, block.images)
-    utc_ns = session.utc_ns[[rows[name] for name in block.images]]
-    told = results.figures(adjusted, site, measured.names, control)
-    session.warnings += _doubts(told, measured, control)
+    stamps = session.time_ns[[rows[name] for name in block.images]]
+    shift = np.array([round(one.timeshift_s * 1e9) for one in block.rig.cameras])[block.camera]
+    utc_ns = np.where(stamps == NO_TIME, NO_TIME, stamps + shift)
+    told = results.figures(adjusted, session.site, measured.names, session.control) | more
+    session.warnings += _doubts(told, session, measured)
     told["left_out"] = session.left_out
     told["warnings"] = session.warnings
-    poses = results.map_poses(adjusted, site, utc_ns)
-    results.write_all(task.output, adjusted, site, poses, measured.names, told)
+    poses = results.map_poses(adjusted, session.site, utc_ns)
+    results.write_all(task.output, adjusted, session.site, poses, measured.names, told)
     return told
 
 
-def _doubts(told: dict[str, Any], measured: Measurements, control: Control | None) -> list[str]:
+def _doubts(told: dict[str, Any], session: Session, measured: Measurements) -> list[str]:
     """Sentences for who must know."""
     doubts = []
     if measured.strangers:
-        named = ", ".join(measured.strangers[:5])
-        doubts.append(f"{len(measured.strangers)} images of the table of image points are not in the block: {named}")
-    if control is not None:
+        doubts.append(f"images of the tables that are not in the block: {names_listed(measured.strangers)}")
+    if session.control is not None:
         seen = {one["name"] for one in (*told["control"], *told["check"])}
-        lost = [name for name in control.name if name not in seen]
+        lost = [name for name in session.control.name if name not in seen]
         if lost:
-            doubts.append(f"{len(lost)} surveyed points are not determined by images: {', '.join(lost[:5])}")
+            doubts.append(f"surveyed points that no images determine: {names_listed(lost)}")
         if told["control"] and told["datum"] != "observed":
             doubts.append(
-                "fewer than three control points: the block is a free network, and they were not enough to lay it"
+                f"{len(told['control'])} control points do not lay the block, expected three or more: {told['datum']}"
             )
     gross = told["counts"]["left_out"]["gross"]
     if gross:
         doubts.append(f"{gross} image points are gross errors and were left out")
     if not told["settled"]:
         doubts.append(f"the adjustment had not settled after {told['steps']} steps")
+    rms = told["residual_rms_px"]
+    if rms is not None and rms > _MOST_RMS_PX:
+        doubts.append(f"residuals of {rms:.1f} px RMS, expected about one: is the camera model the right one?")
     return doubts
 
 
-__all__ = ["Session", "Task", "replace", "run"]
+__all__ = ["Task", "run"]

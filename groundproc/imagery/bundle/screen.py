@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from groundproc.imagery.bundle.block import LIDAR, Block, PointRows
 from groundproc.imagery.bundle.covariance import Balance, Cofactors, balance, cofactors, traces
+from groundproc.imagery.bundle.intersection import intersect
 from groundproc.imagery.bundle.observed import pose_residuals, whitening
 from groundproc.imagery.bundle.solve import Solved, image_residuals, normal_of, row_residuals, solve
 from groundproc.imagery.bundle.unknowns import lay_out
@@ -24,6 +25,12 @@ GROSS: Final = 10.0
 WRONG: Final = 4.0
 """A match of the machine is wrong beyond so many times what is usual."""
 MOST_ROUNDS: Final = 8
+LEAST_CHANGE: Final = 1e-4
+"""Rounds end where less than this part of the measurements comes or goes."""
+LEAST_ANGLE_RAD: Final = float(np.deg2rad(0.3))
+"""Rays that meet under less do not make a point."""
+MOST_SOFT: Final = 12
+SOFT_STEPS: Final = 5
 _NORMAL: Final = 1.1774
 """Median length of two unit normals."""
 _PRIOR_BEND: Final = 4.0
@@ -67,24 +74,22 @@ def adjust(block: Block, known: tuple[RigCamera, ...], matched: Mask, progress: 
         Measurements that the machine found; the others come from people.
     progress : callable, optional
     """
-    reasons = {"single": 0, "behind": 0, "gross": 0, "wrong": 0}
-    block = _without_single(block, reasons)
+    block = _without_single(block)
     factor = 1.0
     if matched.any():
-        block = _softened(block, matched)
+        block = _led(block, known, matched, progress)
     solved = solve(block, known, progress)
     for _ in range(MOST_ROUNDS):
-        block, out = _screened(solved.block, matched, reasons)
-        block = _without_single(block, reasons)
-        block = _weighed_priors(block)
-        if not out and np.array_equal(block.priors.weight, solved.block.priors.weight):
+        block, changed = _screened(solved.block, matched)
+        block = _weighed_priors(_without_single(block))
+        if changed < LEAST_CHANGE * len(matched) and np.array_equal(block.priors.weight, solved.block.priors.weight):
             break
         solved = solve(block, known, progress)
     if matched.any():
         solved, factor = _scaled(solved, matched, progress)
     found = cofactors(solved)
     left_out = solved.block.measured.weight == 0.0
-    return Adjusted(solved, found, balance(solved, found), left_out, reasons, factor)
+    return Adjusted(solved, found, balance(solved, found), left_out, _reasons(solved.block, matched), factor)
 
 
 def distances(block: Block) -> tuple[Array, Mask]:
@@ -98,32 +103,63 @@ def usual(distance: Array) -> float:
     return float(np.median(distance)) / _NORMAL if len(distance) else 1.0
 
 
-def _softened(block: Block, matched: Mask) -> Block:
-    """Weights by which a first solution is not led astray by wrong matches (Geman & McClure)."""
-    distance, reached = distances(block)
-    used = matched & (block.measured.weight > 0.0) & reached
-    scale = 2.0 * max(usual(distance[used]), 1.0) if used.any() else 1.0
-    weight = np.where(matched, 1.0 / (1.0 + np.square(distance / scale)) ** 2, 1.0)
-    keep = np.where(reached, weight, 0.0) * (block.measured.weight > 0.0)
-    return replace(block, measured=replace(block.measured, weight=keep))
+def _led(block: Block, known: tuple[RigCamera, ...], matched: Mask, progress: Progress | None) -> Block:
+    """A first solution that wrong matches do not lead astray: a few steps at a time, with weights that narrow (Geman & McClure)."""
+    scale = np.inf
+    for _ in range(MOST_SOFT):
+        distance, reached = distances(block)
+        seen = matched & reached
+        now = max(usual(distance[seen]), 0.3) if seen.any() else 1.0
+        if now > 0.9 * scale:
+            break
+        scale = now
+        weight = np.where(matched, 1.0 / (1.0 + np.square(distance / (3.0 * scale))) ** 2, 1.0)
+        block = replace(block, measured=replace(block.measured, weight=np.where(reached, weight, 0.0)))
+        block = _without_single(block)
+        block = solve(block, known, progress, SOFT_STEPS).block
+    return block
 
 
-def _screened(block: Block, matched: Mask, reasons: dict[str, int]) -> tuple[Block, int]:
-    """Leave out what is behind its camera, gross or wrong; how many were."""
+def _screened(block: Block, matched: Mask) -> tuple[Block, int]:
+    """Weights of 1, and 0 for what is behind its camera, gross or wrong; what fits again comes back. How many changed."""
+    block = revived(block)
     measured = block.measured
     distance, reached = distances(block)
-    used = measured.weight > 0.0
-    behind = used & ~reached
-    by_hand, by_machine = used & reached & ~matched, used & reached & matched
-    gross = by_hand & (distance > GROSS * max(1.0, usual(distance[by_hand])))
-    wrong = by_machine & (distance > WRONG * max(usual(distance[by_machine]), 0.02))
-    reasons["behind"] += int(behind.sum())
-    reasons["gross"] += int(gross.sum())
-    reasons["wrong"] += int(wrong.sum())
-    out = behind | gross | wrong
-    weight = np.where(used & ~out, 1.0, 0.0)
-    changed = int(out.sum()) + int((used & ~out & (measured.weight != 1.0)).any())
+    by_hand, by_machine = reached & ~matched, reached & matched
+    gross = by_hand & (distance > GROSS * max(1.0, usual(distance[by_hand & (measured.weight > 0.0)])))
+    wrong = by_machine & (distance > WRONG * max(usual(distance[by_machine & (measured.weight > 0.0)]), 0.02))
+    kept = reached & ~gross & ~wrong
+    changed = int((kept != (measured.weight > 0.0)).sum()) + int(((measured.weight != 1.0) & kept).any()) * len(kept)
+    weight = np.where(kept, 1.0, 0.0)
     return replace(block, measured=replace(measured, weight=weight), rows=_weighed_rows(block)), changed
+
+
+def revived(block: Block) -> Block:
+    """Points that nothing determines placed anew from where their images are now: what was left out may fit."""
+    measured = block.measured
+    used = np.bincount(measured.point[measured.weight > 0.0], minlength=len(block.points_m))
+    asked = np.bincount(measured.point, minlength=len(block.points_m))
+    lost = (used < 2) & (asked >= 2)
+    if not lost.any():
+        return block
+    every = replace(block, measured=replace(measured, weight=np.ones(len(measured))))
+    places, angle = intersect(every)
+    found = lost & np.asarray(np.isfinite(places).all(axis=1)) & (angle > LEAST_ANGLE_RAD)
+    return replace(block, points_m=np.where(found[:, None], places, block.points_m))
+
+
+def _reasons(block: Block, matched: Mask) -> dict[str, int]:
+    """How many measurements are left out, and why."""
+    distance, reached = distances(block)
+    out = block.measured.weight == 0.0
+    used = ~out & reached
+    alone = np.bincount(block.measured.point, minlength=len(block.points_m))[block.measured.point] < 2
+    meant = out & reached & ~alone
+    gross = meant & ~matched & (distance > GROSS * max(1.0, usual(distance[used & ~matched])))
+    wrong = meant & matched & (distance > WRONG * max(usual(distance[used & matched]), 0.02))
+    single = out & (alone | (reached & ~gross & ~wrong))
+    counted = {"single": single, "behind": out & ~reached & ~alone, "gross": gross, "wrong": wrong}
+    return {name: int(mask.sum()) for name, mask in counted.items()}
 
 
 def _weighed_rows(block: Block) -> PointRows:
@@ -150,13 +186,12 @@ def _weighed_priors(block: Block) -> Block:
     return replace(block, priors=replace(priors, weight=np.round(weight, 2).astype(np.float64)))
 
 
-def _without_single(block: Block, reasons: dict[str, int]) -> Block:
+def _without_single(block: Block) -> Block:
     """Leave out measurements of points that nothing else determines."""
     measured = block.measured
     known = tuple(block.rig.cameras)
     kept = normal_of(block, known, lay_out(block)).kept
     bad = ~kept.determined[measured.point] & (measured.weight > 0.0)
-    reasons["single"] += int(bad.sum())
     weight = np.where(bad, 0.0, measured.weight)
     rows = block.rows
     seen = np.zeros(len(block.points_m), np.bool_)

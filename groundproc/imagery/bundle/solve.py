@@ -54,7 +54,12 @@ class Solved:
     settled: bool
 
 
-def solve(block: Block, known: tuple[RigCamera, ...], progress: Callable[[int, float], None] | None = None) -> Solved:
+def solve(
+    block: Block,
+    known: tuple[RigCamera, ...],
+    progress: Callable[[int, float], None] | None = None,
+    most_steps: int = MOST_STEPS,
+) -> Solved:
     """Adjust a block.
 
     Parameters
@@ -64,6 +69,8 @@ def solve(block: Block, known: tuple[RigCamera, ...], progress: Callable[[int, f
         Cameras as known before; their `sigma` are priors.
     progress : callable, optional
         Told the number of each step and the sum of squares.
+    most_steps : int
+        Fewer where weights will change anyway.
 
     Raises
     ------
@@ -73,7 +80,7 @@ def solve(block: Block, known: tuple[RigCamera, ...], progress: Callable[[int, f
     unknowns = lay_out(block)
     now, damping = cost(block, known, unknowns), _FIRST_DAMPING
     settled, number = False, 0
-    for number in range(1, MOST_STEPS + 1):
+    for number in range(1, most_steps + 1):
         normal = normal_of(block, known, unknowns, damping)
         while True:
             trial = _stepped(block, normal, damping)
@@ -188,7 +195,7 @@ def _moved_camera(block: Block, unknowns: Unknowns, number: int, step: Array) ->
     mat = mat_of_vector(turn) @ one.mat_cam_ins
     return replace(
         one, camera=one.camera.with_values(lens) if lens else one.camera, mat_cam_ins=mat, origin_cam_m=-mat @ lever,
-        timeshift_s=one.timeshift_s + mount["timeshift"], line_delay_s=one.line_delay_s + mount["line_delay"],
+        timeshift_s=float(one.timeshift_s + mount["timeshift"]), line_delay_s=float(one.line_delay_s + mount["line_delay"]),
     )  # fmt: skip
 
 

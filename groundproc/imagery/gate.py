@@ -1,0 +1,76 @@
+"""Is a boresight or a clock's shift real? Views that are held out must agree better with it than without.
+
+Every fifth station loses its image points. Its pose is then the trajectory's, with the mounting and the clock that the others found, and
+the points that the others placed are looked at from there.
+"""
+
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.imagery.bundle.block import Block
+from groundproc.imagery.bundle.solve import image_residuals, normal_of, solve
+from groundproc.imagery.bundle.unknowns import lay_out
+from groundproc.imagery.rig import RigCamera
+
+Mask = npt.NDArray[np.bool_]
+
+LEAST_STATIONS: Final = 10
+EVERY: Final = 5
+BETTER: Final = 0.98
+"""What is accepted makes the median residual of held-out views at least so much smaller."""
+BORESIGHT: Final = ("boresight_x", "boresight_y", "boresight_z", "lever_x", "lever_y", "lever_z")
+GROUPS: Final = (("boresight", BORESIGHT), ("timeshift", ("timeshift",)), ("line_delay", ("line_delay",)))
+
+
+def candidates(camera: RigCamera) -> tuple[str, ...]:
+    """Groups that a camera could have: those whose prior sigma is stated."""
+    keys = {"boresight": "boresight_deg", "timeshift": "timeshift_s", "line_delay": "line_delay_s"}
+    return tuple(name for name, _ in GROUPS if camera.sigma.get(keys[name]))
+
+
+def accepted(block: Block, known: tuple[RigCamera, ...]) -> tuple[tuple[tuple[str, ...], ...], list[dict[str, Any]]]:
+    """Which unknowns of the mounting are taken, for each camera, and what held-out views said of each group.
+
+    Parameters
+    ----------
+    block : Block
+        With wrong matches left out.
+    known : tuple of RigCamera
+    """
+    stations = np.unique(block.priors.station)
+    wanted = [candidates(one) for one in known]
+    if len(stations) < LEAST_STATIONS:
+        every = tuple(tuple(u for name, group in GROUPS if name in own for u in group) for own in wanted)
+        told = [{"group": name, "accepted": True, "reason": "too few views to hold any out"} for name, _ in GROUPS
+                if any(name in own for own in wanted)]  # fmt: skip
+        return every, told
+    held = np.isin(block.station[block.measured.image], stations[EVERY // 2 :: EVERY])
+    taken: tuple[tuple[str, ...], ...] = tuple(() for _ in known)
+    best = _error(block, known, taken, held)
+    told = []
+    for name, group in GROUPS:
+        if not any(name in own for own in wanted):
+            continue
+        trial = tuple((*have, *group) if name in own else have for have, own in zip(taken, wanted, strict=True))
+        error = _error(block, known, trial, held)
+        better = error < BETTER * best
+        told.append({"group": name, "accepted": bool(better), "held_out_px": error, "without_px": best})
+        if better:
+            taken, best = trial, error
+    return taken, told
+
+
+def _error(block: Block, known: tuple[RigCamera, ...], mounting: tuple[tuple[str, ...], ...], held: Mask) -> float:
+    """Median residual of held-out measurements [px] with some unknowns of the mounting."""
+    weight = np.where(held, 0.0, block.measured.weight)
+    training = replace(block, measured=replace(block.measured, weight=weight), mounting=mounting)
+    # points that only held-out views see say nothing
+    kept = normal_of(training, known, lay_out(training)).kept
+    weight = np.where(kept.determined[training.measured.point], weight, 0.0)
+    solved = solve(replace(training, measured=replace(training.measured, weight=weight)), known)
+    residual, reached = image_residuals(solved.block, solved.unknowns)
+    seen = held & (block.measured.weight > 0.0) & reached & kept.determined[block.measured.point]
+    return float(np.median(np.linalg.norm(residual[seen], axis=1))) if seen.any() else float("inf")
