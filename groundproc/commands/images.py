@@ -43,6 +43,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=Path, metavar="CSV", help="first poses, columns of poses.csv; no observations")
     parser.add_argument("--times", type=Path, metavar="FILE", help="which image when: .MRK, or a CSV with image,utc_ns")
     parser.add_argument("--crs", "--epsg", metavar="EPSG", help="projected CRS; default: the cloud's, or a UTM zone")
+    parser.add_argument(
+        "--hybrid", choices=("gained", "true"), default="gained",
+        help="what hybrid/trajectory.csv holds for `swath process --poses`: what images add to the trajectory, or adjusted poses that "
+        "are taken to be true; default: gained",
+    )  # fmt: skip
+    parser.add_argument(
+        "--hybrid-every",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="at most one of these in so many seconds; default: 0, all",
+    )
     parser.add_argument("--json", action="store_true", help="print what bundle.json holds")
     add_force(parser)
 
@@ -72,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     task = work.Task(
         arguments.output, images, logs[0] if logs else None, arguments.trajectory, arguments.rig, arguments.cloud,
         arguments.control, arguments.image_points, arguments.marks, arguments.start, arguments.times, arguments.crs,
+        arguments.hybrid, arguments.hybrid_every,
     )  # fmt: skip
     with tqdm(unit="", leave=False, disable=not sys.stderr.isatty()) as bar:
 

@@ -22,7 +22,9 @@ from groundproc.imagery.tables import Control, write_points
 
 Array = npt.NDArray[np.float64]
 
-FILES: Final = ("poses.csv", "rig.yaml", "bundle.json", "points.csv", "residuals.png", "colmap")
+HYBRID: Final = "hybrid"
+"""Folder of the poses that go back to the smoother."""
+FILES: Final = ("poses.csv", "rig.yaml", "bundle.json", "points.csv", "colmap", HYBRID)
 
 
 COMMON_SIGMA_M: Final = 0.015

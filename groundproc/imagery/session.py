@@ -44,6 +44,10 @@ class Task:
         Pictures and folders of them.
     log, trajectory, rig, cloud, control, image_points, marks, start, times : Path, optional
     crs : str, optional
+    hybrid : str
+        What is handed back to the smoother: "gained" or "true" (`hybrid`).
+    every_s : float
+        At most one pose in so many seconds; 0 for every image.
     """
 
     output: Path
@@ -58,6 +62,8 @@ class Task:
     start: Path | None = None
     times: Path | None = None
     crs: str | None = None
+    hybrid: str = "gained"
+    every_s: float = 0.0
 
 
 @dataclass(slots=True)

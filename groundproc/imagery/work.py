@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError, UsageError
-from groundproc.imagery import assembly, flown, gate, located, results
+from groundproc.imagery import assembly, flown, gate, hybrid, located, results
 from groundproc.imagery.assembly import Assembled, Known
 from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.screen import Adjusted, adjust
@@ -19,6 +19,7 @@ from groundproc.imagery.session import Progress, Session, Task, begin, known_of,
 from groundproc.imagery.surface import Surface, held_to, read_surface
 from groundproc.imagery.ties import Features, features_of, match_all, pairs_of
 from groundproc.imagery.tracks import tracks_of
+from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -160,7 +161,19 @@ def _finish(
     told["warnings"] = session.warnings
     poses = results.map_poses(adjusted, session.site, utc_ns)
     results.write_all(task.output, adjusted, session.site, poses, measured.names, told)
+    if session.trajectory is not None:
+        _hand_back(task, session.trajectory, adjusted)
     return told
+
+
+def _hand_back(task: Task, trajectory: Trajectory, adjusted: Adjusted) -> None:
+    """Poses for the smoother."""
+    block, unknowns = adjusted.solved.block, adjusted.solved.unknowns
+    if task.hybrid == hybrid.TRUE:
+        poses = hybrid.taken_as_true(block)
+    else:
+        poses = hybrid.gained(block, unknowns, adjusted.found, results.scale_of(adjusted))
+    hybrid.write_gained(task.output / results.HYBRID, hybrid.thinned(poses, task.every_s), trajectory.frame)
 
 
 def _doubts(told: dict[str, Any], session: Session, measured: Measurements) -> list[str]:
