@@ -1,13 +1,13 @@
 """What is said of each point beyond its place: the angles of its beam, how well it is known, what surface it lies on.
 
-Some of it follows from the point and its pose, some from what lies around it. For that the flight is gone through twice, one stretch after
-the other: first all points of the stretch are gathered, then each is looked at again, in the same order. A stretch ends where memory
-does, so the cost is linear and the memory bounded.
+Some of it follows from the point and its pose, some from what lies around it. For that the flight is gone through again, one stretch after
+the other: first all points of the stretch are gathered, for classes all beams are looked along, then each point is looked at again, in the
+same order. A stretch ends where memory does, so the cost is linear and the memory bounded.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from flightlog.errors import ConfigError
 from flightlog.mount import Mount
+from groundproc.cloud import cleaning, freespace
 from groundproc.cloud.beams import Beams
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import Errors, MountErrors
@@ -29,9 +30,10 @@ NAMES: Final[Mapping[str, tuple[str, ...]]] = {
     "scan_angle": ("scan_angle",),
     "incidence": ("incidence",),
     "sigma": ("sigma_h", "sigma_v"),
+    "classes": ("classification", "mixed"),
 }
 """What can be asked for, and the columns that it fills."""
-_OF_SURROUNDINGS: Final = frozenset({"incidence"})
+_OF_SURROUNDINGS: Final = frozenset({"incidence", "classes"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +70,54 @@ def wanted(names: tuple[str, ...] | None) -> frozenset[str]:
 
 def passes(names: frozenset[str]) -> int:
     """How often the flight is gone through for some attributes."""
-    return 2 if names & _OF_SURROUNDINGS else 1
+    return 3 if "classes" in names else 2 if names & _OF_SURROUNDINGS else 1
 
 
-def described(stream: Stream, scene: Scene, names: frozenset[str]) -> Iterator[Points]:
+@dataclass(slots=True)
+class Found:
+    """What was found of the points, counted.
+
+    Attributes
+    ----------
+    classes : dict of int to int
+        Points of each class.
+    mixed : int
+        Points that are echoes of two surfaces.
+    stretches : list of cleaning.Classes
+        One for each stretch of flight that was cleaned.
+    """
+
+    classes: dict[int, int] = field(default_factory=dict)
+    mixed: int = 0
+    stretches: list[cleaning.Classes] = field(default_factory=list)
+
+    def add(self, points: Points) -> None:
+        """Count points."""
+        if "classification" in points and "mixed" in points:
+            for number, count in enumerate(np.bincount(points["classification"])):
+                if count:
+                    self.classes[number] = self.classes.get(number, 0) + int(count)
+            self.mixed += int(np.count_nonzero(points["mixed"]))
+
+    def tell(self) -> dict[str, Any]:
+        """For quality.json; empty where nothing was cleaned."""
+        if not self.stretches:
+            return {}
+        doubtful = [each.contradicted for each in self.stretches if not each.trusted]
+        note = (
+            f"in {len(doubtful)} of {len(self.stretches)} stretches of the flight beams pass through {max(doubtful):.1%} of the voxels at "
+            "another time, walls among them: the path does not come back to where it was, and nothing is classed as moving or mixed there"
+            if doubtful
+            else ""
+        )
+        return {
+            "classes": {str(each): self.classes[each] for each in sorted(self.classes)},
+            "mixed": self.mixed,
+            "note": note,
+        }
+
+
+def described(stream: Stream, scene: Scene, names: frozenset[str], found: Found | None = None) -> Iterator[Points]:
     """Points with their attributes, in their order.
 
     Parameters
@@ -81,34 +127,65 @@ def described(stream: Stream, scene: Scene, names: frozenset[str]) -> Iterator[P
     scene : Scene
     names : frozenset of str
         Of `NAMES`.
+    found : Found, optional
+        Is added to.
     """
+    found = Found() if found is None else found
     if not names & _OF_SURROUNDINGS:
         yield from (_with_attributes(points, scene, names, None) for points in stream())
         return
-    ahead, behind = stream(), stream()
+    ahead, along, behind = (stream() for _ in range(3))
     while True:
-        around, pieces = _gathered(ahead)
+        around, pieces = _gathered(ahead, scene)
         if not pieces:
             return
         around.find_planes()
+        classes: cleaning.Classes | None = None
+        if "classes" in names:
+            evidence = _looked(around, itertools.islice(along, pieces), scene)
+            classes = cleaning.classify(around, evidence)
+            found.stretches.append(classes)
         for points in itertools.islice(behind, pieces):
-            yield _with_attributes(points, scene, names, around)
+            points = _with_attributes(points, scene, names, _Known(around, classes))
+            found.add(points)
+            yield points
         del around  # the next stretch takes its memory
 
 
-def _gathered(ahead: Iterator[Points]) -> tuple[Surroundings, int]:
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What lies around the points of a stretch, and the classes of its voxels where they are asked for."""
+
+    around: Surroundings
+    classes: cleaning.Classes | None
+
+
+def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Evidence:
+    """What the beams of a stretch passed through."""
+    evidence = freespace.Evidence.none(around.used)
+    for points in pieces:
+        if len(points):
+            origins = Beams.of(points.time_ns, scene.trajectory, scene.mount).origins(points.time_ns)
+            voxel = around.of(points.xyz_m)
+            slant = around.incidence_deg(points.xyz_m, origins, voxel)
+            freespace.look_along(around, evidence, points.xyz_m, origins, points.time_ns, slant, voxel)
+    return evidence
+
+
+def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, int]:
     """The surroundings of the next stretch of flight, and the number of its pieces."""
     around, pieces = Surroundings(), 0
     for points in ahead:
         pieces += 1
         if len(points):
-            around.add(points.xyz_m, points.time_ns, points["range"])
+            beams = Beams.of(points.time_ns, scene.trajectory, scene.mount)
+            around.add(points.xyz_m, points.time_ns, beams.origins(points.time_ns))
         if around.full:
             break
     return around, pieces
 
 
-def _with_attributes(points: Points, scene: Scene, names: frozenset[str], around: Surroundings | None) -> Points:
+def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known: _Known | None) -> Points:
     """One piece with its attributes."""
     if not len(points):
         return points
@@ -118,9 +195,18 @@ def _with_attributes(points: Points, scene: Scene, names: frozenset[str], around
     slant = None
     if "scan_angle" in names:
         columns["scan_angle"] = beams.scan_angle_deg(points.xyz_m, points.time_ns, origins)
-    if around is not None:
-        slant = around.incidence_deg(points.xyz_m, origins, around.of(points.xyz_m))
-        columns["incidence"] = slant
+    if known is not None:
+        voxel = known.around.of(points.xyz_m)
+        slant = known.around.incidence_deg(points.xyz_m, origins, voxel)
+        if "incidence" in names:
+            columns["incidence"] = slant
+        if known.classes is not None:
+            columns["classification"] = known.classes.of_voxel[voxel]
+            columns["mixed"] = (
+                cleaning.mixed(known.around, points.xyz_m, origins, voxel)
+                if known.classes.trusted
+                else np.zeros(len(points), np.uint8)
+            )
     if "sigma" in names:
         errors = Errors.of(points.time_ns, scene.trajectory, scene.mount, scene.mount_errors)
         columns["sigma_h"], columns["sigma_v"] = errors.sigmas_m(

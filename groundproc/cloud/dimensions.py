@@ -133,7 +133,8 @@ TABLE: Final = (
         "number_of_returns", "u1", "number of returns", "How many echoes of the shot there are.", "sensor", field="number_of_returns",
     ),
     Dimension(
-        "classification", "u1", "class", "ASPRS class; 0 is never classified.", "other programs", field="classification",
+        "classification", "u1", "class", "ASPRS class; 0 is never classified, 64 is what moved (docs/attributes.md).", "attributes",
+        field="classification",
     ),
     Dimension(
         "scan_angle", "i2", "scan angle",
@@ -158,6 +159,9 @@ TABLE: Final = (
     Dimension(
         "incidence", "u1", "incidence", "Angle between the beam and the normal of the surface around the point; none where there is none.",
         "attributes", "deg", 1.0, no_data=255,
+    ),
+    Dimension(
+        "mixed", "u1", "mixed echo", "1: the echo is of two surfaces, and lies between them.", "attributes",
     ),
     Dimension(
         "sigma_h", "u2", "sigma horizontal", "How well its place is known, one sigma of each horizontal axis; the GNSS is in it.",

@@ -26,6 +26,8 @@ _ORDER: Final = (2, 1, 0)
 """Levels that are asked for a plane, in this order, before the neighbours are; the largest are asked last."""
 MOST: Final = 4_000_000
 """Voxels of a stretch of flight: some 400 MB."""
+LOOK_MS: Final = 50
+"""Shots of one voxel within so long are one look: they are of one revolution, and err together."""
 MOST_POINTS: Final = 4096
 """Points of a voxel that its moments are made of: a hover adds nothing more."""
 _BEGIN: Final = 1 << 16
@@ -52,8 +54,12 @@ class Voxels(NamedTuple):
         How many points the sums are of; sums of x, y, z, xx, xy, xz, yy, yz, zz from the middle of the voxel [m, m^2].
     when_ms : ndarray of int32, shape (n, 2)
         First and last time of a point, from the begin of the stretch.
+    looks : ndarray of int32, shape (n,)
+        How often it was hit, what comes within `LOOK_MS` counted once.
     farthest_m : ndarray of float32, shape (n,)
         Largest range of a point.
+    seen : ndarray of float32, shape (n, 3)
+        Sum of the directions of the beams that hit it.
     normal : ndarray of float32, shape (n, 3)
         Unit vector; zero where there is no plane.
     """
@@ -62,7 +68,9 @@ class Voxels(NamedTuple):
     many: Ints
     sums: Single
     when_ms: Ints
+    looks: Ints
     farthest_m: Single
+    seen: Single
     normal: Single
 
     @classmethod
@@ -70,7 +78,8 @@ class Voxels(NamedTuple):
         """Room for so many."""
         return cls(
             np.zeros(size, np.int64), np.zeros(size, np.int32), np.zeros((size, 10), np.float32),
-            np.zeros((size, 2), np.int32), np.zeros(size, np.float32), np.zeros((size, 3), np.float32),
+            np.zeros((size, 2), np.int32), np.zeros(size, np.int32), np.zeros(size, np.float32), np.zeros((size, 3), np.float32),
+            np.zeros((size, 3), np.float32),
         )  # fmt: skip
 
 
@@ -80,6 +89,16 @@ class Surroundings:
     Parameters
     ----------
     edge_m : float
+
+    Attributes
+    ----------
+    voxels : Voxels
+    used : int
+        How many there are.
+    levels : list of Surroundings
+        This and the larger ones, of 2, 4, 8, 16 times the edge, when the planes are found.
+    parents : list of ndarray of int32, shape (used,)
+        In which voxel of each larger level each of these is.
     """
 
     def __init__(self, edge_m: float = EDGE_M) -> None:
@@ -88,27 +107,32 @@ class Surroundings:
         self.used = 0
         self.table = np.full(4 * _BEGIN, -1, np.int32)
         self.begin_ns: int | None = None
+        self.levels: list[Surroundings] = []
+        self.parents: list[Ints] = []
 
     @property
     def full(self) -> bool:
         """Whether the stretch of flight is to end here."""
         return self.used > MOST
 
-    def add(self, xyz_m: Array, time_ns: Times, range_m: Single) -> None:
-        """Take points, shape (n, 3), with their times and ranges."""
+    def add(self, xyz_m: Array, time_ns: Times, origins_m: Array) -> None:
+        """Take points, shape (n, 3), with their times and the places of the sensor."""
         if self.begin_ns is None:
             self.begin_ns = int(time_ns[0])
         self._make_room(len(xyz_m))
         self.used = int(
-            _add(
-                xyz_m, (time_ns - self.begin_ns) // 1_000_000, range_m, self.edge_m, self.table, self.voxels, self.used
-            )
+            _add(xyz_m, self.elapsed_ms(time_ns), origins_m, self.edge_m, self.table, self.voxels, self.used)
         )
+
+    def elapsed_ms(self, time_ns: Times) -> Times:
+        """Times since the begin of the stretch."""
+        return np.asarray((time_ns - (self.begin_ns or 0)) // 1_000_000)
 
     def find_planes(self) -> None:
         """Find the plane of each voxel: all points are there."""
         levels: list[Surroundings] = [self]
         parents: list[Ints] = []
+        self.levels, self.parents = levels, parents
         for _ in range(LEVELS):
             below = levels[-1]
             larger = Surroundings(2.0 * below.edge_m)
@@ -199,8 +223,8 @@ def _place_of(key: Any, table: Any, keys: Any, used: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _add(xyz: Any, time_ms: Any, range_m: Any, edge_m: float, table: Any, voxels: Voxels, used: int) -> int:
-    keys, many, sums, when, farthest = voxels.key, voxels.many, voxels.sums, voxels.when_ms, voxels.farthest_m
+def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels: Voxels, used: int) -> int:
+    keys, many, sums, when = voxels.key, voxels.many, voxels.sums, voxels.when_ms
     per_m = 1.0 / edge_m
     for n in range(len(xyz)):
         i, j, k = np.floor(xyz[n, 0] * per_m), np.floor(xyz[n, 1] * per_m), np.floor(xyz[n, 2] * per_m)
@@ -208,11 +232,19 @@ def _add(xyz: Any, time_ms: Any, range_m: Any, edge_m: float, table: Any, voxels
         v = _place_of(key, table, keys, used)
         if v == used:
             used += 1
-            when[v, 0] = time_ms[n]
+            when[v, 0], when[v, 1] = time_ms[n], time_ms[n] - LOOK_MS
         many[v] += 1
+        if time_ms[n] - when[v, 1] >= LOOK_MS:
+            voxels.looks[v] += 1
         when[v, 1] = time_ms[n]
-        farthest[v] = max(farthest[v], range_m[n])
         if many[v] <= MOST_POINTS:
+            a, b, c = xyz[n, 0] - origin[n, 0], xyz[n, 1] - origin[n, 1], xyz[n, 2] - origin[n, 2]
+            square = a * a + b * b + c * c
+            inverse = 1.0 / np.sqrt(max(square, 1e-12))
+            voxels.farthest_m[v] = max(voxels.farthest_m[v], square * inverse)
+            voxels.seen[v, 0] += a * inverse
+            voxels.seen[v, 1] += b * inverse
+            voxels.seen[v, 2] += c * inverse
             x = np.float32(xyz[n, 0] - (i + 0.5) * edge_m)
             y = np.float32(xyz[n, 1] - (j + 0.5) * edge_m)
             z = np.float32(xyz[n, 2] - (k + 0.5) * edge_m)
@@ -278,6 +310,7 @@ def _join(voxels: Voxels, edge_m: float, table: Any, larger: Voxels, parent: Any
         x, y, z = middle_of(key, edge_m)
         a, b, c = middle_of(above, 2.0 * edge_m)
         _add_moved(larger.sums[w], voxels.sums[v], x - a, y - b, z - c)
+        larger.many[w] += voxels.many[v]
     return found
 
 
@@ -316,7 +349,7 @@ def has_plane(normal: Any, v: int) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _off(voxels: Voxels, v: int, edge_m: float, others: Voxels, w: int, others_edge_m: float) -> Any:
+def off_plane(voxels: Voxels, v: int, edge_m: float, others: Voxels, w: int, others_edge_m: float) -> Any:
     """How far the mean of a voxel is off the plane of another, perhaps larger one [m]."""
     x, y, z = middle_of(voxels.key[v], edge_m)
     a, b, c = middle_of(others.key[w], others_edge_m)
@@ -334,7 +367,7 @@ def _take(voxels: Voxels, edge_m: float, parent: Any, larger: Voxels, larger_edg
         w = parent[v]
         if has_plane(normal, v) or not has_plane(larger.normal, w):
             continue
-        if _off(voxels, v, edge_m, larger, w, larger_edge_m) < _NEAR_M:
+        if off_plane(voxels, v, edge_m, larger, w, larger_edge_m) < _NEAR_M:
             for a in range(3):
                 normal[v, a] = larger.normal[w, a]
 
@@ -353,7 +386,7 @@ def _borrow(table: Any, voxels: Voxels, used: int, edge_m: float) -> None:
                 for k in range(-1, 2):
                     w = find(beside(keys[v], i, j, k), table, keys)
                     if w >= 0 and has_plane(normal, w):
-                        off = _off(voxels, v, edge_m, voxels, w, edge_m)
+                        off = off_plane(voxels, v, edge_m, voxels, w, edge_m)
                         if off < least:
                             least, chosen[v] = off, w
     for v in range(used):

@@ -97,6 +97,7 @@ def work(run: Run, folders: Folders) -> None:
         seen = shots(run.readers, timeline, gate, lasers, next(tallies), told)
         return placing.placed(seen, made.trajectory, made.mount)
 
+    found = attributes.Found()
     scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging)
     with contextlib.ExitStack() as stack:
         sinks: list[Making] = []
@@ -105,7 +106,7 @@ def work(run: Run, folders: Folders) -> None:
                 own = replace(context, folder=folders[each.name])
                 sinks += stack.enter_context(streamed([each], own))
         try:
-            described = attributes.described(stream, scene, names)
+            described = attributes.described(stream, scene, names, found)
             placed = placing.handed_on(described, made.trajectory, projection, sinks)
         except CoverageError:
             if tally.packets:
@@ -114,7 +115,7 @@ def work(run: Run, folders: Folders) -> None:
                 f"{run.readers[0].path}: no lidar packets in the log, so that there is nothing to place"
             ) from None
     if WHOLE in folders:
-        _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed)
+        _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed, found)
 
 
 def mount_errors(made: Estimate, survey: Survey) -> MountErrors:
@@ -140,7 +141,14 @@ def shared(told: Callable[[int], None], passes: int) -> Callable[[int], None]:
     return tell
 
 
-def _tell(path: Path, lidar: Lidar, projection: geodesy.Projection, tally: Tally, placed: placing.Placed) -> None:
+def _tell(
+    path: Path,
+    lidar: Lidar,
+    projection: geodesy.Projection,
+    tally: Tally,
+    placed: placing.Placed,
+    seen: attributes.Found,
+) -> None:
     """Write what became of the shots."""
     found = {
         "crs": {"epsg": projection.crs.to_epsg(), "name": projection.crs.name},
@@ -161,7 +169,8 @@ def _tell(path: Path, lidar: Lidar, projection: geodesy.Projection, tally: Tally
             "written": placed.points,
             "range_step_m": lidar.range_step_m,
             "shots_dropped": asdict(placed.dropped),
-        },
+        }
+        | seen.tell(),
     }
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

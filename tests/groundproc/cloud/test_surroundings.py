@@ -29,7 +29,7 @@ def around(xyz: Array) -> Surroundings:
     made = Surroundings()
     for some in np.array_split(xyz, 7):
         if len(some):
-            made.add(np.ascontiguousarray(some), START_NS + np.arange(len(some)), np.ones(len(some), np.float32))
+            made.add(np.ascontiguousarray(some), START_NS + np.arange(len(some)), np.tile(SENSOR, (len(some), 1)))
     made.find_planes()
     return made
 
@@ -96,7 +96,7 @@ def test_room_for_more_voxels_is_made_without_losing_any() -> None:
     xyz = rng.uniform(-60, 60, (200_000, 3))
     made = Surroundings()
     for some in np.array_split(xyz, 9):
-        made.add(np.ascontiguousarray(some), START_NS + np.arange(len(some)), np.ones(len(some), np.float32))
+        made.add(np.ascontiguousarray(some), START_NS + np.arange(len(some)), np.tile(SENSOR, (len(some), 1)))
     cells = np.unique(np.floor(xyz / made.edge_m).astype(int), axis=0)
     assert made.used == len(cells)
     assert int(made.voxels.many[: made.used].sum()) == len(xyz)
@@ -142,7 +142,7 @@ def test_points_come_in_their_order_whatever_the_stretches(monkeypatch: pytest.M
         for some, before in zip(found, pieces(), strict=True):
             np.testing.assert_array_equal(some.xyz_m, before.xyz_m)
             if len(some):
-                assert set(some.columns) == {"range", "scan_angle", "incidence", "sigma_h", "sigma_v"}
+                assert set(some.columns) == {"range", *(name for each in attributes.NAMES.values() for name in each)}
                 assert np.isfinite(some["incidence"]).mean() > 0.95
 
 
