@@ -361,3 +361,41 @@ def _conductors(rng: np.random.Generator, xy: Array, ground: Array) -> list[Wire
             second = np.append(xy[n + 1] + offset * across, ground[n + 1] + height)
             wires.append(_hung(first, second, float(rng.uniform(180, 420))))
     return wires
+
+
+def with_vehicles(xyz: Array, above_m: Array, seed: int, count: int) -> tuple[Array, Array]:
+    """A cloud seen from above, with boxes of the size of cars in the way of some pulses.
+
+    Points below the top of a box and above its area are lifted onto it; its front is lower. The top is parallel to the ground under it.
+
+    Parameters
+    ----------
+    xyz : ndarray, shape (n, 3)
+    above_m : ndarray, shape (n,)
+        Heights above a smooth ground.
+    seed, count : int
+
+    Returns
+    -------
+    xyz : ndarray, shape (n, 3)
+    boxes : ndarray, shape (count, 6)
+        Middle east and north, turn from east [rad], length, width, height.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = xyz[:, :2].min(axis=0) + 6.0, xyz[:, :2].max(axis=0) - 6.0
+    boxes: list[tuple[float, ...]] = []
+    while len(boxes) < count:
+        x, y = rng.uniform(low, high)
+        if all(np.hypot(x - b[0], y - b[1]) > 9.0 for b in boxes):
+            boxes.append((x, y, rng.uniform(0, np.pi), rng.uniform(4, 4.8), rng.uniform(1.7, 2), rng.uniform(1.4, 1.9)))
+    out = xyz.copy()
+    for x, y, turn, length, width, height in boxes:
+        near = np.flatnonzero(np.abs(xyz[:, :2] - (x, y)).max(axis=1) < 4.0)
+        d = xyz[near, :2] - (x, y)
+        design = np.column_stack([np.ones(len(d)), d])
+        ground = design @ np.linalg.lstsq(design, xyz[near, 2] - above_m[near], rcond=None)[0]
+        u, v = d @ [np.cos(turn), np.sin(turn)], d @ [-np.sin(turn), np.cos(turn)]
+        hit = (np.abs(u) < length / 2) & (np.abs(v) < width / 2) & (above_m[near] < height)
+        top = np.where(u > length / 4, 0.6 * height, height)
+        out[near[hit], 2] = (ground + top + rng.normal(0, 0.03, len(near)))[hit]
+    return out, np.array(boxes)

@@ -188,6 +188,7 @@ TABLE: Final = (
     ),
     Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),
     Dimension("clearance", "f4", "to the nearest wire", "Distance to the nearest wire.", "wires", "m"),
+    Dimension("object", "u2", "number of object", "Number of the object that was detected; 0 is none.", "detect"),
 )  # fmt: skip
 """All columns that points may have, in the order of the file and of the documentation."""
 
