@@ -184,6 +184,9 @@ TABLE: Final = (
         "temperature", "f4", "temperature", "Of the surface, as a thermal camera has it.", "`swath colour`", "deg C",
     ),
     Dimension(
+        "ndvi", "f4", "vegetation index", "Difference of near infrared and red over their sum, -1 to 1.", "`swath ndvi`",
+    ),
+    Dimension(
         "views", "u1", "views", "Images that see the point, 255 at most; 0: it has no colour.", "`swath colour`",
     ),
     Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),

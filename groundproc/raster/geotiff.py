@@ -2,7 +2,7 @@
 
 import contextlib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 import rasterio
+from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy
 from rasterio.transform import from_origin
@@ -49,11 +50,11 @@ def write(
     path: Path,
     grid: Grid,
     crs: pyproj.CRS | None,
-    band: Band,
+    band: Band | Sequence[Band],
     block: Callable[[Window], npt.NDArray[Any]],
     corner_m: tuple[float, float] | None = None,
 ) -> None:
-    """Write a raster of one band, a block at a time.
+    """Write a raster, a block at a time.
 
     Parameters
     ----------
@@ -61,9 +62,11 @@ def write(
         Written to in place: the caller writes aside. A temporary file lies beside it meanwhile.
     grid : Grid
     crs : pyproj.CRS or None
-    band : Band
+    band : Band or sequence of Band
+        Several of one type and one value for no data.
     block : callable
-        Gives the values of a window, shape (rows, columns), the first row in the north; NaN where there is none.
+        Gives the values of a window, shape (rows, columns), of several bands (rows, columns, bands), the first row in the north; NaN
+        where there is none.
     corner_m : tuple of 2 floats, optional
         West and north edge, where they are no whole multiples of the cell: those of another program's raster.
 
@@ -73,9 +76,12 @@ def write(
         It cannot be written.
     """
     plain = path.with_name(f"{path.name}.plain")
+    bands = [band] if isinstance(band, Band) else list(band)
+    dtype, no_data = bands[0].dtype, bands[0].no_data
+    assert all((each.dtype, each.no_data) == (dtype, no_data) for each in bands), bands
     profile = {
-        "driver": "GTiff", "width": grid.columns, "height": grid.rows, "count": 1, "dtype": band.dtype,
-        "nodata": band.no_data, "transform": from_origin(*(corner_m or (grid.west_m, grid.north_m)), grid.cell_m, grid.cell_m),
+        "driver": "GTiff", "width": grid.columns, "height": grid.rows, "count": len(bands), "dtype": dtype,
+        "nodata": no_data, "transform": from_origin(*(corner_m or (grid.west_m, grid.north_m)), grid.cell_m, grid.cell_m),
         "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "bigtiff": "IF_SAFER", "sparse_ok": True,
     }  # fmt: skip
     if crs is not None:
@@ -83,18 +89,16 @@ def write(
     try:
         with rasterio.open(plain, "w", **profile) as file:
             file.update_tags(TIFFTAG_SOFTWARE=f"swath {__version__}")
-            file.set_band_description(1, band.name)
-            if band.unit:
-                file.set_band_unit(1, band.unit)
+            _describe(file, bands)
             for window in grid.blocks(BLOCK):
-                values = np.asarray(block(window))
-                if band.no_data is not None and values.dtype.kind == "f":
-                    values = np.where(np.isfinite(values), values, band.no_data)
-                file.write(values.astype(band.dtype), 1, window=_window(grid, window))
-        predictor = "3" if np.dtype(band.dtype).kind == "f" else "2"
+                values = np.atleast_3d(np.asarray(block(window)))
+                if no_data is not None and values.dtype.kind == "f":
+                    values = np.where(np.isfinite(values), values, no_data)
+                file.write(np.moveaxis(values.astype(dtype), -1, 0), window=_window(grid, window))
+        predictor = "3" if np.dtype(dtype).kind == "f" else "2"
         copy(
             plain, path, driver="COG", compress="DEFLATE", predictor=predictor, blocksize=BLOCK,
-            overview_resampling=band.resampling, bigtiff="IF_SAFER", num_threads="ALL_CPUS",
+            overview_resampling=bands[0].resampling, bigtiff="IF_SAFER", num_threads="ALL_CPUS",
         )  # fmt: skip
     except (RasterioError, OSError) as error:
         raise SourceError(f"{path}: cannot be written ({_sentence(error)})") from None
@@ -188,6 +192,17 @@ def opened(path: Path) -> Iterator[Raster]:
         crs = None if file.crs is None else pyproj.CRS.from_wkt(file.crs.to_wkt())
         grid = Grid(column, row, file.width, file.height, cell_m)
         yield Raster(path, grid, float(transform.c), float(transform.f), crs, file)
+
+
+def _describe(file: Any, bands: Sequence[Band]) -> None:
+    """What each band is; programs show red, green and blue as a picture."""
+    colours = {"red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue}
+    for number, band in enumerate(bands, 1):
+        file.set_band_description(number, band.name)
+        if band.unit:
+            file.set_band_unit(number, band.unit)
+    if len(bands) > 1:
+        file.colorinterp = [colours.get(band.name, ColorInterp.undefined) for band in bands]
 
 
 def _window(grid: Grid, window: Window) -> Any:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +19,17 @@ from groundproc.imagery.painting.scene import Scene, Square, mapped, towards
 from groundproc.imagery.painting.views import Views
 from groundproc.imagery.painting.visibility import Depths, Seen, project
 
+Load = Callable[[Image], npt.NDArray[Any]]
+"""Gives the picture of an image, shape (height, width, planes)."""
+
 _THREADS: Final = 2
 _EDGE: Final = 0.5
 """Weight at the corner of a picture, of that in its middle: lenses are worst there."""
+
+
+def plain(image: Image) -> npt.NDArray[Any]:
+    """The picture as the file has it."""
+    return pictures.picture(image.path)
 
 
 def room(size: int, layer: Layer, folder: Path) -> Views:
@@ -42,7 +50,9 @@ def part(views: Views, points: slice) -> Views:
     return Views(views.image[points], views.weight[points], views.value[points], views.total[points])
 
 
-def paint(block: Block, layer: Layer, scene: Scene, views: Views, progress: Callable[[int], object]) -> tuple[str, ...]:
+def paint(
+    block: Block, layer: Layer, scene: Scene, views: Views, progress: Callable[[int], object], load: Load = plain
+) -> tuple[str, ...]:
     """Lay all images of a layer over the points of a scene; gives what became of those that could not be read.
 
     Parameters
@@ -54,13 +64,14 @@ def paint(block: Block, layer: Layer, scene: Scene, views: Views, progress: Call
         Of all its points; filled.
     progress : callable
         Told of images done.
+    load : callable
     """
     locks = {id(square): threading.Lock() for square in scene.squares}
 
     def one(number: int) -> str:
         image = layer.images[number]
         try:
-            shown = pictures.picture(image.path)
+            shown = load(image)
         except CaptureError as error:
             return str(error)
         for square, seen, weight in visible(block, image, scene):
@@ -78,22 +89,31 @@ def paint(block: Block, layer: Layer, scene: Scene, views: Views, progress: Call
 
 def visible(block: Block, image: Image, scene: Scene) -> Iterator[tuple[Square, Seen, npt.NDArray[np.float32]]]:
     """The points that an image sees, square by square, with the weights of its view of them."""
-    camera = block.rig.cameras[image.camera].camera
-    near = list(towards(scene.squares, image.eye.place_m, image.axis, blocks.half_angle_rad(camera)))
-    looked = [(square, seen) for square in near if len((seen := _in_picture(image, scene, square)).number)]
-    if not looked:
+    found = depths_of(block, image, scene)
+    if found is None:
         return
-    usual_m = float(
-        np.median(np.concatenate([seen.range_m[:: max(1, len(seen.range_m) // 1000)] for _, seen in looked]))
-    )
-    depths = Depths(image.eye, camera.focal_px, float(np.median([square.spacing_m for square, _ in looked])), usual_m)
-    for square, seen in looked:
-        depths.add(seen, scene.spacing_m[square.points][seen.number])
+    depths, looked = found
+    camera = block.rig.cameras[image.camera].camera
     for square, seen in looked:
         clear = depths.sees(seen, scene.surface(square), image.eye.place_m - square.centre_m)
         some = Seen(seen.number[clear], seen.pixel[clear], seen.range_m[clear])
         if len(some.number):
-            yield square, some, _weights(some, camera.width_px, camera.height_px)
+            yield square, some, weights(some, camera.width_px, camera.height_px)
+
+
+def depths_of(block: Block, image: Image, scene: Scene) -> tuple[Depths, list[tuple[Square, Seen]]] | None:
+    """The depth image of a picture, and the points that lie in it, hidden or not; None: there are none."""
+    camera = block.rig.cameras[image.camera].camera
+    near = list(towards(scene.squares, image.eye.place_m, image.axis, blocks.half_angle_rad(camera)))
+    looked = [(square, seen) for square in near if len((seen := _in_picture(image, scene, square)).number)]
+    if not looked:
+        return None
+    ranges = np.concatenate([seen.range_m[:: max(1, len(seen.range_m) // 1000)] for _, seen in looked])
+    spacing_m = float(np.median([square.spacing_m for square, _ in looked]))
+    depths = Depths(image.eye, camera.focal_px, spacing_m, float(np.median(ranges)))
+    for square, seen in looked:
+        depths.add(seen, scene.spacing_m[square.points][seen.number])
+    return depths, looked
 
 
 def _in_picture(image: Image, scene: Scene, square: Square) -> Seen:
@@ -101,7 +121,7 @@ def _in_picture(image: Image, scene: Scene, square: Square) -> Seen:
     return project(eye, scene.xyz_m[square.points])
 
 
-def _weights(seen: Seen, width_px: int, height_px: int) -> npt.NDArray[np.float32]:
+def weights(seen: Seen, width_px: int, height_px: int) -> npt.NDArray[np.float32]:
     """Of views: near is better, and the middle of the picture."""
     off = (seen.pixel - 0.5 * np.array([width_px, height_px], np.float32)) / (0.5 * np.hypot(width_px, height_px))
     taper = 1.0 - (1.0 - _EDGE) * (off**2).sum(axis=1)

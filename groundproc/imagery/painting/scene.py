@@ -78,7 +78,7 @@ class Scene:
             points = slice(first, first + len(records))
             first += len(records)
             corner_m = np.array([place[0] * SIDE_M, place[1] * SIDE_M, base_m])
-            local = _localised(site, corner_m, np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float64))
+            local = localised(site, corner_m, np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float64))
             centre_m = 0.5 * (local.min(axis=0) + local.max(axis=0))
             local -= centre_m
             self.xyz_m[points], self.number[points] = local, records["number"]
@@ -127,7 +127,7 @@ def _spooled(cloud: reader.Cloud, folder: Path, progress: Callable[[int], object
     return spool, base_m or 0.0
 
 
-def _localised(site: Site, corner_m: Array, xyz_m: Array) -> Array:
+def localised(site: Site, corner_m: Array, xyz_m: Array) -> Array:
     """Local coordinates of map coordinates from a corner: by a polynomial of second degree, exact over a square to micrometres."""
     low, high = xyz_m.min(axis=0), xyz_m.max(axis=0)
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)

@@ -69,9 +69,37 @@ def blend(views: Views, gain: npt.NDArray[np.float32], full: float, least: int) 
     return out
 
 
+def sampled(picture: npt.NDArray[Any], pixel: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """What a picture, shape (height, width, planes), shows at places, shape (n, 2), between its pixels: shape (n, planes)."""
+    out = np.empty((len(pixel), picture.shape[2]))
+    _sampled(picture, pixel, out)
+    return np.rint(out) if np.issubdtype(picture.dtype, np.integer) else out
+
+
+@njit(cache=True, nogil=True)
+def _sampled(picture: Any, pixel: Any, out: Any) -> None:
+    for i in range(len(pixel)):
+        _between(picture, pixel[i, 0], pixel[i, 1], out[i])
+
+
+@njit(cache=True, nogil=True)
+def _between(picture: Any, u: float, v: float, out: Any) -> None:
+    """Bilinear interpolation; beyond the middles of the outermost pixels what these show."""
+    height, width, planes = picture.shape
+    u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
+    column, row = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
+    a, b = u - column, v - row
+    below, beside = min(row + 1, height - 1), min(column + 1, width - 1)
+    for plane in range(planes):
+        upper = (1.0 - a) * picture[row, column, plane] + a * picture[row, beside, plane]
+        lower = (1.0 - a) * picture[below, column, plane] + a * picture[below, beside, plane]
+        out[plane] = (1.0 - b) * upper + b * lower
+
+
 @njit(cache=True, nogil=True)
 def _insert(views: Any, picture: Any, number: Any, pixel: Any, weight: Any, image: Any) -> None:
-    height, width, planes = picture.shape
+    planes = picture.shape[2]
+    shown = np.empty(planes)
     images, weights, values, total = views.image, views.weight, views.value, views.total
     most = images.shape[1]
     for i in range(len(number)):
@@ -92,15 +120,9 @@ def _insert(views: Any, picture: Any, number: Any, pixel: Any, weight: Any, imag
             images[point, later], weights[point, later] = images[point, later - 1], weights[point, later - 1]
             values[point, later] = values[point, later - 1]
         images[point, place], weights[point, place] = image, weight[i]
-        u = min(max(pixel[i, 0], 0.0), width - 1.0)
-        v = min(max(pixel[i, 1], 0.0), height - 1.0)
-        column, row = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
-        a, b = u - column, v - row
-        below, beside = min(row + 1, height - 1), min(column + 1, width - 1)
+        _between(picture, pixel[i, 0], pixel[i, 1], shown)
         for plane in range(planes):
-            upper = (1.0 - a) * picture[row, column, plane] + a * picture[row, beside, plane]
-            lower = (1.0 - a) * picture[below, column, plane] + a * picture[below, beside, plane]
-            values[point, place, plane] = (1.0 - b) * upper + b * lower
+            values[point, place, plane] = shown[plane]
 
 
 @njit(cache=True, nogil=True)
