@@ -29,6 +29,8 @@ RESULTS: Final = ROOT / "build" / "bench-study"
 METHODS: Final = ("ins", "adjusted", "adjusted_causal")
 SQUARE: Final = "ins: {gyro_misalignment_deg: 0, accel_misalignment_deg: 0}\ngyros: {misalignment_deg: 0}"
 """Inertial units whose axes are those of their boards, so that the boresight is what their gyros show."""
+AIR: Final = "flight: {buzz_deg_s: [0.5, 1.8, 1.8], gust_deg: 0.05}\ngyros: {rotor_line_deg_s: [1.0, 1.0, 0.3]}"
+"""What the air and the motors do on the flights over natural scenes, for others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,16 @@ TRIALS: Final = (
     Trial("lidar turned", "survey_slow_gyro", 48, changes="mount: {lidar_deg: [90, -30, 0], lever_spread_m: 0.05}"),
     Trial("lasers off", "survey_fast_gyro", 49, changes="lidar: {laser_bias_m: 0.01, elevation_error_deg: 0.05}"),
     Trial("gyros 3 % off", "survey_fast_gyro", 50, changes="ins: {gyro_scale: 0.03}\ngyros: {scale: 0.03}"),
+    *(Trial(f"air, fast {seed}", "survey_fast_gyro", seed, changes=AIR) for seed in (61, 67)),
+    Trial("air, slow 62", "survey_slow_gyro", 62, changes=AIR),
+    Trial("air, 540 rpm", "survey_slow_gyro", 66, changes=AIR + "\nlidar: {rpm: 540}"),
+    Trial("air, wood", "survey_fast_gyro", 63, scene="wood", changes=AIR),
+    *(Trial(f"meadow {seed}", "meadow", seed, 40.0) for seed in (31, 64)),
+    *(Trial(f"hover before lines {seed}", "hover_lines", seed, 40.0) for seed in (21, 22)),
+    *(Trial(f"crops {seed}", "crops", seed, 40.0) for seed in (21, 22)),
+    *(Trial(f"slope {seed}", "slope", seed, 40.0) for seed in (21, 22)),
+    Trial("bare field", "barefield", 21, 40.0),
+    *(Trial(f"facades {seed}", "facades", seed, 40.0) for seed in (21, 22)),
     Trial("autopilot 20 ms late", "survey_slow_gyro", 51, changes="ins: {gyro_delay_s: 0.02, position_delay_s: 0.2}"),
 )  # fmt: skip
 
