@@ -43,6 +43,8 @@ FEWEST: Final = 60.0
 GATE_M: Final = 0.15
 HUBER: Final = 2.0
 """Sigmas beyond which a cluster loses weight."""
+SURE_RAD: Final = np.deg2rad(0.002)
+"""How closely a part of the flight goes on where the one before ended."""
 BACK_S: Final = 0.1
 """Within so long the path's knots bring errors back."""
 
@@ -63,40 +65,42 @@ def refined(path: Path, pieces: Iterable[Slice], grid_ns: int, density: float, v
     voxel_m : float
         Edge of the voxels whose planes make the map.
     """
-    quat = path.quat.copy()
+    turns = np.zeros((len(path.quat), 3))
     cluster = Clusterer(voxel_m)
     clusters: list[npt.NDArray[np.void]] = []
     planes, first, last = PlaneMap(voxel_m), 0, 0
     for piece in pieces:
-        at = (grid_ns + piece.number * SLICE_NS - path.start_ns) // STEP_NS
-        if at < 0 or at + STEPS >= len(quat) or not len(piece.xyz_m):
+        at = int((grid_ns + piece.number * SLICE_NS - path.start_ns) // STEP_NS)
+        if at < first or at + STEPS >= len(turns) or not len(piece.xyz_m):
             continue
         if clusters and at - first >= CHUNK * STEPS:
-            quat[first:last] = _turned(path, first, last, clusters, planes, density)
+            _turn(path, slice(first, last), turns, clusters, planes, density)
             clusters, planes = [], PlaneMap(voxel_m)
         if not clusters:
-            first = int(at)
-        last = int(at) + STEPS + 1
-        here = slice(int(at), last)
-        start_ns = path.start_ns + int(at) * STEP_NS
-        found, world = cluster(piece, start_ns, path.quat[here], path.position_m[here])
+            first = at
+        last = at + STEPS + 1
+        start_ns = path.start_ns + at * STEP_NS
+        found, world = cluster(piece, start_ns, path.quat[at:last], path.position_m[at:last])
         planes.insert(world, found, Odometry.MOST)
         clusters.append(found[["time_ns", "xyz", "count"]].copy())
     if clusters:
-        quat[first:last] = _turned(path, first, last, clusters, planes, density)
-    return replace(path, quat=quat)
+        _turn(path, slice(first, last), turns, clusters, planes, density)
+    return replace(path, quat=frames.quat_multiply(path.quat, frames.quat_exp(turns)))
 
 
-def _turned(
-    path: Path, first: int, last: int, clusters: list[npt.NDArray[np.void]], planes: PlaneMap, density: float
-) -> Array:
-    """Attitudes of the grid from `first` to before `last`."""
-    part = Path(path.start_ns + first * STEP_NS, path.quat[first:last], path.position_m[first:last])
+def _turn(
+    path: Path, here: slice, turns: Array, clusters: list[npt.NDArray[np.void]], planes: PlaneMap, density: float
+) -> None:
+    """Find the turns of a part of the grid; its first goes on from what the part before found there, if that was next to it."""
+    part = Path(path.start_ns + here.start * STEP_NS, path.quat[here], path.position_m[here])
     diagonal, beside = gyro_information(part.quat, density)
     pull = np.zeros((len(part.quat), 3))
+    if turns[here.start].any():
+        diagonal[0] += np.eye(3) / SURE_RAD**2
+        pull[0] -= turns[here.start] / SURE_RAD**2
     for some in clusters:
         _add(some["time_ns"], some["xyz"], some["count"], part.arrays, planes.arrays, (diagonal, beside, pull))
-    return np.asarray(frames.quat_multiply(part.quat, frames.quat_exp(solved(diagonal, beside, -pull))))
+    turns[here] = solved(diagonal, beside, -pull)
 
 
 def gyro_information(quat: Array, density: float) -> tuple[Array, Array]:

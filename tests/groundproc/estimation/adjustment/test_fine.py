@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
+from groundproc.estimation.adjustment import fine
 from groundproc.estimation.adjustment.fine import BACK_S, gyro_information, refined, solved
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.slices import Slice
@@ -88,6 +89,21 @@ def test_a_path_without_noise_gets_next_to_none(true: Path, pieces: list[Slice])
     made = at(true, pieces)
     believed = DENSITY * np.sqrt(0.5 * BACK_S)
     assert np.sqrt(np.square(off_rad(made, true)).mean()) < believed / 3.0
+
+
+def test_parts_of_a_flight_go_on_where_the_one_before_ended(
+    true: Path, pieces: list[Slice], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two poses the turns differ by the gyro's noise over 5 ms, at the borders of the parts as elsewhere."""
+    path = noisy(true)
+    monkeypatch.setattr(fine, "CHUNK", 10)
+    made = at(path, pieces)
+    steps = np.diff(off_rad(made, path), axis=0)
+    borders = np.array([10, 20]) * STEPS
+    assert np.linalg.norm(steps[borders - 1], axis=1).max() < np.linalg.norm(steps, axis=1).max() + 1e-9
+    assert np.linalg.norm(steps[borders - 1], axis=1).max() < 4.0 * DENSITY * np.sqrt(STEP_NS * 1e-9)
+    before, after = (np.square(off_rad(each, true)).mean() for each in (path, made))
+    assert after < 0.7 * before  # a second's map is not as good as that of two and a half
 
 
 def test_where_the_lidar_sees_nothing_the_path_stays(true: Path, pieces: list[Slice]) -> None:
