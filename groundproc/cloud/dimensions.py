@@ -192,6 +192,20 @@ TABLE: Final = (
     Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),
     Dimension("clearance", "f4", "to the nearest wire", "Distance to the nearest wire.", "wires", "m"),
     Dimension("object", "u2", "number of object", "Number of the object that was detected; 0 is none.", "detect"),
+    Dimension(
+        "epoch", "u1", "which cloud", "The cloud that the point is from, from 0 in the order given.", "`swath change`, `swath fuse`",
+    ),
+    Dimension(
+        "change", "u1", "0 same 1 new 2 gone 3 unseen",
+        "0 unchanged, 1 appeared, 2 vanished, 3 not looked into by the other epoch.", "`swath change`",
+    ),
+    Dimension(
+        "change_distance", "f4", "from the other epoch", "Signed distance from the surface of the other epoch, above it positive; not a "
+        "number where it has none nearby.", "`swath change`", "m",
+    ),
+    Dimension(
+        "change_sigma", "f4", "sigma of change", "Of that distance: both epochs' roughness and the registration.", "`swath change`", "m",
+    ),
 )  # fmt: skip
 """All columns that points may have, in the order of the file and of the documentation."""
 

@@ -44,11 +44,14 @@ class Normals(NamedTuple):
         Of the tilt about the less known axis.
     roughness_m : ndarray, shape (n,)
         Scatter of the patch about its plane.
+    off_m : ndarray, shape (n,)
+        Of the point from the plane, along the normal.
     """
 
     normal: Array
     sigma_rad: Array
     roughness_m: Array
+    off_m: Array
 
 
 class _Level(NamedTuple):
@@ -75,7 +78,7 @@ def normals(xyz_m: Array, edges_m: tuple[float, ...] = EDGES_M) -> Normals:
     Normals
     """
     local = np.ascontiguousarray(xyz_m - np.floor(xyz_m.min(axis=0))) if len(xyz_m) else np.empty((0, 3))
-    found = Normals(np.full((len(local), 3), np.nan), np.full(len(local), np.nan), np.full(len(local), np.nan))
+    found = Normals(np.full((len(local), 3), np.nan), *(np.full(len(local), np.nan) for _ in range(3)))
     limit = np.full(len(local), np.inf)
     levels = [_level(local, edge) for edge in edges_m] if len(local) else []
     for level in levels:
@@ -214,12 +217,16 @@ def _limits(xyz: Any, level: Any, limit: Any) -> None:
 def _choose(xyz: Any, level: Any, limit: Any, found: Any) -> None:
     """The plane of a level that tells each point's normal best, where it is better than what was found."""
     for i in range(len(xyz)):
-        v = level.voxel[i]
+        v, best, least = level.voxel[i], -1, found.sigma_rad[i]
         for k in range(27):
             w = level.near[v, k]
             if w < 0 or level.held[w] == 0.0 or level.rough[w] > limit[i] + _LEAST_M:
                 continue
-            if level.sigma[w] >= found.sigma_rad[i] or _off(xyz, i, level, w) > _ON:
+            if level.sigma[w] >= least or _off(xyz, i, level, w) > _ON:  # nothing is less than NaN, nor not less
                 continue
-            found.normal[i] = level.normal[w]
-            found.sigma_rad[i], found.roughness_m[i] = level.sigma[w], level.rough[w]
+            best, least = w, level.sigma[w]
+        if best >= 0:
+            n, m = level.normal[best], level.mean[best]
+            found.normal[i] = n
+            found.sigma_rad[i], found.roughness_m[i] = level.sigma[best], level.rough[best]
+            found.off_m[i] = n[0] * (xyz[i, 0] - m[0]) + n[1] * (xyz[i, 1] - m[1]) + n[2] * (xyz[i, 2] - m[2])

@@ -227,6 +227,19 @@ class Rays:
         return Seen(legs)
 
 
+def recovered(cloud: Cloud) -> Seen | None:
+    """The path that a cloud itself tells; None where it does not."""
+    if not cloud.timed:
+        return None
+    rays = Rays()
+    for chunk in reader.chunks(cloud, columns=()):
+        rays.add(chunk)
+    try:
+        return rays.path()
+    except CoverageError:
+        return None
+
+
 def _leg(rays: Array) -> Leg | None:
     """The path that the rays of a strip, shape (n, 8) in time order, meet best; None: they do not tell it.
 

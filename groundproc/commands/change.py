@@ -1,0 +1,68 @@
+"""`swath change`: what appeared and what vanished between two epochs."""
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "compare two epochs of a place: register them, and find what appeared or vanished, down to 1 dm3"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command line."""
+    from groundproc.commands.outputs import add_force
+
+    parser.add_argument("a", type=Path, metavar="A", help="the earlier cloud: LAS, LAZ or COPC")
+    parser.add_argument("b", type=Path, metavar="B", help="the later one")
+    parser.add_argument("--trajectory-a", type=Path, metavar="FILE", help="of A's flight: what its beams went through")
+    parser.add_argument("--trajectory-b", type=Path, metavar="FILE", help="of B's flight")
+    parser.add_argument(
+        "--voxel", type=float, metavar="M", help="edge; default: three spacings of points, 0.1 m at least"
+    )
+    parser.add_argument("--sway", type=float, metavar="M", help="how far leaves move; default: 0.25, or two voxels")
+    parser.add_argument("--registered", action="store_true", help="the clouds lie on each other already")
+    parser.add_argument("--week", type=int, metavar="N", help="GPS week, where the files have only seconds of it")
+    parser.add_argument("--geoid", type=float, default=0.0, metavar="N", help="taken off the trajectories' heights [m]")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the results")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
+    add_force(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare, and say what was found."""
+    from tqdm import tqdm
+
+    from flightlog.errors import UsageError
+    from groundproc.analysis.change import FILES, Task
+    from groundproc.analysis.change import run as compare
+    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, SOLUTION_WORDS, SOLUTIONS, expect
+    from groundproc.commands.outputs import claim_file, claim_folder, write_json
+
+    for word, value in (("--voxel", arguments.voxel), ("--sway", arguments.sway)):
+        if value is not None and not 0.0 < value <= 100.0:
+            raise UsageError(f"{word} {value:g}: expected more than 0 and up to 100 m")
+    expect([arguments.a, arguments.b], CLOUD, CLOUD_WORDS)
+    expect([arguments.trajectory_a, arguments.trajectory_b], SOLUTIONS, SOLUTION_WORDS)
+    claim_folder(arguments.output, FILES, arguments.force)
+    if arguments.json is not None:
+        claim_file(arguments.json, (".json",), arguments.force)
+    task = Task(
+        arguments.a, arguments.b, arguments.output, arguments.trajectory_a, arguments.trajectory_b, arguments.voxel, arguments.sway,
+        arguments.registered, arguments.week, arguments.geoid,
+    )  # fmt: skip
+    with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
+
+        def advance(stage: str, count: int) -> None:
+            bar.set_description(stage, refresh=False)
+            bar.update(count)
+
+        told = compare(task, advance)
+    if arguments.json is not None:
+        write_json(arguments.json, told)
+    found = told["registration"]
+    print(
+        f"registration: residual {found['residual_m'] * 1e3:.1f} mm, sigma {max(found['sigma_m']) * 1e3:.1f} mm, "
+        f"{found['overlap']:.0%} overlap\n"
+        f"{told['appeared']} appeared ({told['appeared_m3']:.3f} m3), {told['vanished']} vanished ({told['vanished_m3']:.3f} m3), "
+        f"voxels of {told['voxel_m']:.2f} m; {arguments.output}"
+    )
+    return 0
