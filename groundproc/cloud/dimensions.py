@@ -195,6 +195,7 @@ TABLE: Final = (
     Dimension(
         "epoch", "u1", "which cloud", "The cloud that the point is from, from 0 in the order given.", "`swath change`, `swath fuse`",
     ),
+    Dimension("along", "f8", "along the section", "Way along the line of a section.", "`swath section`", "m"),
     Dimension(
         "change", "u1", "0 same 1 new 2 gone 3 unseen",
         "0 unchanged, 1 appeared, 2 vanished, 3 not looked into by the other epoch.", "`swath change`",

@@ -1,0 +1,93 @@
+"""Clouds of other scanners and of photogrammetry merged into one, each laid on the first."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flightlog.errors import GeodesyError
+from groundproc.analysis.registration import MOST, Registration, register
+from groundproc.cloud import reader
+from groundproc.cloud.merger import Merger
+from groundproc.files import written_aside
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """A cloud and how it lies on the first; None: it is the first, or was left as it is."""
+
+    path: Path
+    points: int
+    registration: Registration | None
+
+
+def fuse(paths: Sequence[Path], output: Path, registered: bool, progress: Callable[[int], object]) -> list[Laid]:
+    """Merge clouds: the first as it is, the others moved onto it; `epoch` says which cloud a point is from.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    output : Path
+    registered : bool
+        They lie on each other already: all points stay where they are.
+    progress : callable
+        Told of points done.
+
+    Raises
+    ------
+    GeodesyError
+        They are in different CRS.
+    CoverageError
+        One does not fit on the first.
+    """
+    clouds = [reader.look(path) for path in paths]
+    first = clouds[0]
+    for other in clouds[1:]:
+        a, b = first.horizontal, other.horizontal
+        if a is not None and b is not None and not a.equals(b, ignore_axis_order=True):
+            raise GeodesyError(f"{other.path}: is in {b.name}, but {first.path} in {a.name}; expected one CRS")
+    laid = [Laid(first.path, first.points, None)]
+    if registered:
+        laid += [Laid(cloud.path, cloud.points, None) for cloud in clouds[1:]]
+    else:
+        base = _sample(first, progress)
+        for cloud in clouds[1:]:
+            what = f"{first.path} and {cloud.path}"
+            laid.append(Laid(cloud.path, cloud.points, register(base, _sample(cloud, progress), what)))
+    with written_aside(output) as aside, Merger(clouds, aside, ("epoch",)) as merged:
+        for number, (cloud, each) in enumerate(zip(clouds, laid, strict=True)):
+            for chunk in reader.chunks(cloud, columns=()):
+                moved = None if each.registration is None else each.registration.move(chunk.points.xyz_m)
+                merged.write(chunk.record, {"epoch": np.full(len(chunk.points), number, np.uint8)}, moved)
+                progress(len(chunk.points))
+    return laid
+
+
+def _sample(cloud: reader.Cloud, progress: Callable[[int], object]) -> Array:
+    step = max(1, -(-cloud.points // MOST))
+    parts = []
+    for chunk in reader.chunks(cloud, columns=()):
+        parts.append(chunk.points.xyz_m[::step])
+        progress(len(chunk.points))
+    return np.concatenate(parts)
+
+
+def told(laid: Sequence[Laid]) -> list[dict[str, Any]]:
+    """Plain figures."""
+    out = []
+    for number, each in enumerate(laid):
+        one: dict[str, Any] = {"epoch": number, "file": str(each.path), "points": each.points}
+        found = each.registration
+        if found is not None:
+            sigma = np.sqrt(np.diag(found.covariance))
+            one |= {
+                "matrix": found.matrix.tolist(), "sigma_m": sigma[:3].tolist(), "sigma_deg": np.rad2deg(sigma[3:]).tolist(),
+                "residual_m": found.residual_m, "overlap": found.overlap, "fit": found.fit,
+            }  # fmt: skip
+        out.append(one)
+    return out

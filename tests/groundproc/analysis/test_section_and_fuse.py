@@ -1,0 +1,94 @@
+"""`swath section` and `swath fuse`: points come out as they went in."""
+
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+import pytest
+from scipy.spatial.transform import Rotation
+
+from groundproc.cli import main
+
+ORIGIN = np.array([533_000.0, 6_472_000.0, 100.0])
+
+
+def write(path: Path, xyz: np.ndarray, point_format: int = 6, epsg: int = 32633) -> Path:
+    header = laspy.LasHeader(version="1.4" if point_format > 5 else "1.2", point_format=point_format)
+    header.scales, header.offsets = [0.001] * 3, ORIGIN
+    header.add_crs(pyproj.CRS.from_epsg(epsg))
+    header.add_extra_dim(laspy.ExtraBytesParams("own", np.int16, "another program's"))
+    las = laspy.LasData(header)
+    las.xyz = xyz + ORIGIN
+    las.intensity = np.arange(len(xyz)) % 60_000
+    las["own"] = np.arange(len(xyz)) % 1000
+    las.classification = np.arange(len(xyz)) % 7
+    las.return_number = las.number_of_returns = np.ones(len(xyz), np.uint8)
+    if "red" in las.point_format.dimension_names:
+        las.red = np.arange(len(xyz)) % 65_000
+    las.write(path)
+    return path
+
+
+def test_a_section_keeps_what_lies_near_the_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(1)
+    xyz = rng.uniform((0, 0, 0), (50, 40, 10), (40_000, 3)).round(3)
+    write(tmp_path / "a.laz", xyz)
+    line = f"{ORIGIN[0] + 5},{ORIGIN[1] + 5},{ORIGIN[0] + 45},{ORIGIN[1] + 35}"
+    words = ["section", str(tmp_path / "a.laz"), "--line", line, "--width", "0.8", "-o", str(tmp_path / "s.laz")]
+    assert (
+        main(
+            [*words, "--picture", str(tmp_path / "s.png"), "--colour", "intensity", "--json", str(tmp_path / "s.json")]
+        )
+        == 0
+    )
+    along, across = (xyz[:, :2] - 5) @ (0.8, 0.6), (xyz[:, :2] - 5) @ (-0.6, 0.8)
+    inside = (along >= 0) & (along <= 50) & (np.abs(across) <= 0.4)
+    found = laspy.read(tmp_path / "s.laz")
+    np.testing.assert_allclose(found.xyz, xyz[inside] + ORIGIN, atol=1e-6)
+    assert (np.asarray(found["own"]) == np.flatnonzero(inside) % 1000).all()
+    np.testing.assert_allclose(found["along"], along[inside], atol=1e-6)
+    assert json.loads((tmp_path / "s.json").read_text())["points"] == inside.sum()
+    assert (tmp_path / "s.png").stat().st_size > 10_000
+    capsys.readouterr()
+    for line, expected in (
+        ("0,0,10,10", "no point lies within"),
+        ("1,1,1,1", "expected more than 0"),
+        ("1,2,3", "4 numbers"),
+    ):
+        assert main(["section", str(tmp_path / "a.laz"), "--line", line, "-o", str(tmp_path / "t.laz")]) in (1, 2)
+        assert expected in capsys.readouterr().err
+        assert not (tmp_path / "t.laz").exists()
+
+
+def surface(rng: np.random.Generator, count: int) -> np.ndarray:
+    xy = rng.uniform(0, 25, (count, 2))
+    z = 0.8 * np.sin(xy[:, 0] / 3) + 0.5 * np.cos(xy[:, 1] / 2.5)
+    wall = np.column_stack([rng.uniform(5, 15, count // 5), np.full(count // 5, 12.0), rng.uniform(1, 5, count // 5)])
+    return np.asarray(np.concatenate([np.column_stack([xy, z]), wall]) + rng.normal(0, 0.01, (count + count // 5, 3)))
+
+
+def test_clouds_of_other_kinds_are_laid_on_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(2)
+    a, b = surface(rng, 60_000), surface(rng, 40_000)
+    turn, shift = Rotation.from_rotvec(np.radians([0.2, 0.1, -0.6])), np.array([0.3, 0.2, -0.1])
+    write(tmp_path / "a.laz", a)
+    write(tmp_path / "b.laz", turn.apply(b) + shift, 3)
+    words = ["fuse", str(tmp_path / "a.laz"), str(tmp_path / "b.laz"), "-o", str(tmp_path / "f.laz")]
+    assert main([*words, "--json", str(tmp_path / "f.json")]) == 0
+    found = laspy.read(tmp_path / "f.laz")
+    assert len(found) == len(a) + len(b)
+    np.testing.assert_allclose(found.xyz[: len(a)], a + ORIGIN, atol=0.00051)
+    assert np.abs((found.xyz[len(a) :] - b - ORIGIN).mean(axis=0)).max() < 0.003
+    assert (np.asarray(found["epoch"]) == np.repeat([0, 1], [len(a), len(b)])).all()
+    assert (np.asarray(found.red)[len(a) :] == np.arange(len(b)) % 65_000).all()
+    assert (np.asarray(found["own"])[len(a) :] == np.arange(len(b)) % 1000).all()
+    assert (np.asarray(found.classification)[len(a) :] == np.arange(len(b)) % 7).all()
+    assert json.loads((tmp_path / "f.json").read_text())["clouds"][1]["residual_m"] < 0.02
+    write(tmp_path / "c.laz", rng.uniform(0, 25, (30_000, 3)))
+    capsys.readouterr()
+    assert main(["fuse", str(tmp_path / "a.laz"), str(tmp_path / "c.laz"), "-o", str(tmp_path / "g.laz")]) == 1
+    told = capsys.readouterr().err
+    assert "of one place" in told or "on surfaces found" in told
+    assert not (tmp_path / "g.laz").exists()
