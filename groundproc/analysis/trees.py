@@ -1,0 +1,112 @@
+"""From a cloud to a list of its trees, square by square.
+
+Memory: that of the ground (see `terrain.floor`) and a square of a million points.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from scipy.spatial import cKDTree
+
+from groundproc.analysis.crowns import Tree, crowns, dead
+from groundproc.analysis.terrain.floor import Floor
+from groundproc.cloud import reader
+from groundproc.cloud.tiles import Tiles, side_for
+from groundproc.files import written_aside
+from groundproc.vectors.features import Features, write_features
+
+BUSH_M: Final = 1.0
+TREE_M: Final = 3.0
+_HALO_M: Final = 10.0
+_DEEPEST_M: Final = -1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is asked for: see the options of `swath trees`."""
+
+    cloud: Path
+    output: Path
+    least_m: float = TREE_M
+
+
+@dataclass(slots=True)
+class Made:
+    """Trees, and which are dead."""
+
+    trees: list[Tree] = field(default_factory=list)
+    dead: list[bool] = field(default_factory=list)
+    points: int = 0
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def kinds(self) -> list[str]:
+        """`tree`, `dead` or `bush` for each."""
+        return [
+            "bush" if each.height_m < TREE_M else "dead" if gone else "tree"
+            for each, gone in zip(self.trees, self.dead, strict=True)
+        ]
+
+    def figures(self) -> dict[str, Any]:
+        """For JSON."""
+        heights = [each.height_m for each in self.trees]
+        kinds = self.kinds
+        return {
+            "points": self.points, "trees": kinds.count("tree"), "dead": kinds.count("dead"), "bushes": kinds.count("bush"),
+            "stems_seen": sum(each.stem for each in self.trees),
+            "median_height_m": float(np.median(heights)) if heights else None, "warnings": self.warnings,
+        }  # fmt: skip
+
+
+def work(task: Task, progress: Callable[[int], object]) -> Made:
+    """Find the trees, and write them; `progress` is told of points read.
+
+    Raises
+    ------
+    CaptureError, CoverageError, GeodesyError, SourceError
+        A file is not as it should be.
+    """
+    cloud = reader.look(task.cloud)
+    made = Made(points=cloud.points)
+    with written_aside(task.output) as aside:
+        floor = Floor(cloud, task.output.parent, progress)
+        grid = floor.grid
+        side = side_for(cloud.points, (0.0, 0.0), (grid.columns * grid.cell_m, grid.rows * grid.cell_m), _HALO_M)
+        tiles = Tiles(task.output.parent, {"above": np.float32}, side, _HALO_M)
+        for _, xyz, noise in floor.pieces():
+            above, kind = floor.heights(xyz, noise)
+            keep = (above > _DEEPEST_M) & (kind != 18) & ~noise
+            tiles.add(xyz[keep], {"above": above[keep]})
+        for tile in tiles:
+            found = crowns(tile.xyz_m, tile.columns["above"], task.least_m)
+            if found:
+                # a tree is of the square that its highest point is in
+                places = np.array([each.top for each in found])
+                nearest = np.asarray(cKDTree(tile.xyz_m[:, :2]).query(places)[1], np.int64)
+                made.trees += [each for each, at in zip(found, nearest, strict=True) if tile.core[at]]
+        made.trees.sort(key=lambda each: (each.y, each.x))
+        made.dead = dead(made.trees)
+        _write(aside, task.output.suffix, floor, made)
+    if not made.trees:
+        made.warnings.append(f"nothing grows higher than {task.least_m:g} m")
+    return made
+
+
+def _write(aside: Path, ending: str, floor: Floor, made: Made) -> None:
+    places = np.array([[each.x, each.y, each.foot_m] for each in made.trees]).reshape(-1, 3)
+    shapes: npt.NDArray[Any] = np.array(shapely.points(floor.metres.back(places)), object)
+
+    def column(name: str) -> npt.NDArray[Any]:
+        return np.array([getattr(each, name) for each in made.trees], np.float64)
+
+    columns = {
+        "kind": np.array(made.kinds, object), "height_m": column("height_m"), "crown_m": column("crown_m"),
+        "stem": np.array([int(each.stem) for each in made.trees], np.int32), "through": column("through"),
+        "points": np.array([each.points for each in made.trees], np.int32),
+    }  # fmt: skip
+    write_features(aside, Features(shapes, columns, floor.cloud.horizontal), "Point Z", "trees", ending)
