@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import center_of_mass, find_objects, gaussian_filter, maximum_filter, watershed_ift
+from scipy.ndimage import center_of_mass, find_objects, gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 
 from groundproc.numerics.robust import sigma
@@ -87,10 +87,10 @@ def crowns(xyz_m: Array, above_m: npt.NDArray[np.float32], least_m: float) -> li
     canopy = np.maximum(fill(cells.window(grid, "max")), np.float32(0.0))
     canopy = eroded(dilated(canopy, 1), 1)
     smooth = gaussian_filter(canopy, _SMOOTHING_M / CELL_M)
-    tops = _tops(smooth, least_m)
+    tops, ends = _tops(smooth, least_m)
     if not len(tops):
         return []
-    number = _segments(smooth, tops)
+    number = _segments(smooth, tops, ends)
     row = np.floor((grid.north_m - xyz_m[:, 1]) / CELL_M).astype(np.int64).clip(0, grid.rows - 1)
     column = np.floor((xyz_m[:, 0] - grid.west_m) / CELL_M).astype(np.int64).clip(0, grid.columns - 1)
     of = number[row, column]
@@ -112,29 +112,49 @@ def crowns(xyz_m: Array, above_m: npt.NDArray[np.float32], least_m: float) -> li
     return found
 
 
-def _tops(smooth: npt.NDArray[np.float32], least_m: float) -> npt.NDArray[np.int64]:
-    """Rows and columns of tops, shape (n, 2): the highest within a distance that grows with their height."""
+def _tops(smooth: npt.NDArray[np.float32], least_m: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+    """Rows and columns of tops, shape (n, 2), and the number of the top that each cell climbs to, from 1; 0: none.
+
+    A top is the highest within a distance that grows with its height; lower ones within it are branches of its crown.
+    """
     local = np.argwhere((smooth == maximum_filter(smooth, 3)) & (smooth >= 0.8 * least_m))
     heights = smooth[local[:, 0], local[:, 1]]
     order = np.argsort(-heights, kind="stable")
     local, heights = local[order], heights[order]
+    owner = np.full(len(local), -1, np.int64)
+    kept = 0
     tree = cKDTree(local * CELL_M) if len(local) else None
-    kept = np.ones(len(local), np.bool_)
     for n in range(len(local)):
-        if kept[n] and tree is not None:
+        if owner[n] < 0 and tree is not None:
             reach = min(_REACH_M[0] + _REACH_M[1] * heights[n], _REACH_M[2])
             near = np.array(tree.query_ball_point(local[n] * CELL_M, reach))
-            kept[near[near > n]] = False
-    return local[kept]
+            kept += 1
+            owner[near[(near >= n) & (owner[near] < 0)]] = kept
+    ends = np.zeros(smooth.shape, np.int32)
+    ends[local[:, 0], local[:, 1]] = owner
+    first = np.unique(owner, return_index=True)[1]
+    return local[first], ends
 
 
-def _segments(smooth: npt.NDArray[np.float32], tops: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-    """Number of the crown of each cell, from 1; 0: none."""
-    markers = np.zeros(smooth.shape, np.int32)
-    markers[tops[:, 0], tops[:, 1]] = np.arange(1, len(tops) + 1)
-    highest = float(smooth.max())
-    level = ((highest - smooth) / max(highest, 1.0) * 60_000).astype(np.uint16)
-    number = watershed_ift(level, markers)
+def _segments(
+    smooth: npt.NDArray[np.float32], tops: npt.NDArray[np.int64], ends: npt.NDArray[np.int32]
+) -> npt.NDArray[np.int32]:
+    """Number of the crown of each cell, from 1; 0: none. Each cell is of the crown whose top the steepest way up leads to."""
+    rows, columns = smooth.shape
+    padded = np.pad(smooth, 1, constant_values=-np.inf)
+    best, step = smooth.copy(), np.zeros(smooth.shape, np.int64)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            other = padded[1 + down : 1 + down + rows, 1 + right : 1 + right + columns]
+            higher = other > best
+            best[higher], step[higher] = other[higher], down * columns + right
+    to = (np.arange(rows * columns) + step.ravel()).astype(np.int64)
+    while True:  # each round doubles the way
+        further = to[to]
+        if np.array_equal(further, to):
+            break
+        to = further
+    number = ends.ravel()[to].reshape(rows, columns)
     top_m = np.concatenate([[np.inf], smooth[tops[:, 0], tops[:, 1]]])
     return np.asarray(np.where(smooth > _CROWN * top_m[number], number, 0), np.int32)
 

@@ -39,8 +39,8 @@ def test_trees_of_a_wood_are_found_where_their_stems_are(tmp_path: Path) -> None
     truth = np.array([(each.x, each.y) for each in wood.trees])
     away = np.hypot(*(places[:, None, :2] - truth).transpose(2, 0, 1))
     nearest, least = away.argmin(axis=0), away.min(axis=0)
-    assert np.mean(least <= 0.5) >= 0.9
-    assert np.mean(away.min(axis=1) > 1.5) < 0.1
+    assert np.mean(least <= 0.5) >= 0.95
+    assert np.mean(away.min(axis=1) > 1.5) < 0.05
     met = least <= 0.5
     heights = np.array([found[n][1]["height_m"] for n in nearest]) - [each.height_m for each in wood.trees]
     assert np.median(np.abs(heights[met])) < 0.2
