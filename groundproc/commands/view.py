@@ -117,13 +117,19 @@ def _served(path: Path, paths: list[npt.NDArray[np.float64]]) -> Iterator[Served
     """The cloud as nodes; one without an index gets a temporary one aside."""
     from tqdm import tqdm
 
+    from flightlog.errors import GeodesyError
     from groundproc.cloud import exports, nodes, reader
+    from groundproc.viewer.scene import units_of
     from groundproc.viewer.served import Served
 
+    cloud = reader.look(path)
+    try:
+        units_of(cloud.crs)
+    except GeodesyError as error:
+        raise GeodesyError(f"{path}: {error}") from None
     with contextlib.ExitStack() as stack:
         octree = path
         if not nodes.is_copc(path):
-            cloud = reader.look(path)
             print(
                 f"{path}: has no index; one is made aside, and removed at the end (`swath export {path} -o NAME.copc.laz` keeps one)",
                 file=sys.stderr,

@@ -11,10 +11,13 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pyproj
 import pytest
 from browser import PROGRAM, Page, browser
 
 from groundproc.cli import main
+from groundproc.cloud.points import Points
+from groundproc.cloud.writer import CloudWriter
 
 Clouds = Callable[[int], tuple[Path, Path]]
 needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
@@ -155,8 +158,10 @@ def test_loops_that_were_not_saved_are_said(tab: Page, clouds: Clouds, tmp_path:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["{folder}/empty"], "no such file"),
         (["{folder}"], "holds no cloud.copc.laz or cloud.laz"),
         (["{folder}/none.laz"], "no such file"),
+        (["{folder}/degrees.laz"], "degrees.laz: coordinates in WGS 84 are angles, expected a projected CRS"),
         (["{cloud}", "--edited", "{folder}/x.ply"], "ends in .ply, expected a name that ends in .laz or .las"),
         (["{cloud}", "--edited", "{folder}/x.copc.laz"], "`swath export` makes a COPC of it"),
         (["{cloud}", "--edited", "{cloud}"], "is an input and cannot be the output too"),
@@ -167,6 +172,8 @@ def test_loops_that_were_not_saved_are_said(tab: Page, clouds: Clouds, tmp_path:
 def test_what_cannot_be_viewed_is_one_sentence(
     clouds: Clouds, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
 ) -> None:
+    with CloudWriter(tmp_path / "degrees.laz", (), crs=pyproj.CRS(4326)) as writer:
+        writer.write(Points(np.arange(9) + 10**18, np.zeros((9, 3))))
     told = [word.format(folder=tmp_path, cloud=clouds(3_000)[0]) for word in words]
     assert main(["view", *told]) in (1, 2)
     error = capsys.readouterr().err
