@@ -204,7 +204,8 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
 
 def _where(folder: Path) -> list[str]:
     """What to look at first, of what was chosen."""
-    shown = [folder / name for name in ("cloud_height.png", "cloud_intensity.png") if (folder / name).exists()]
+    names = ("report.html", "cloud_height.png", "cloud_intensity.png")
+    shown = [folder / name for name in names if (folder / name).exists()][:2]
     parts = [f"look at {' and '.join(map(str, shown))}"] if shown else []
     if (figures := folder / "quality.json").exists():
         parts.append(f"all figures are in {figures}")
