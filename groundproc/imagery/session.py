@@ -85,6 +85,8 @@ class Session:
     start : ImagePoses, optional
     trajectory : Trajectory, optional
     site : Site
+    lasting : tuple of float or ndarray
+        What variances of the trajectory's places and turns are multiplied by, because its errors last.
     warnings : list of str
     left_out : dict
         Images that are not in the block, and why.
@@ -100,6 +102,7 @@ class Session:
     start: ImagePoses | None = None
     trajectory: Trajectory | None = None
     site: Site = field(default_factory=lambda: cartesian(np.zeros((1, 3))))
+    lasting: tuple[Array | float, Array | float] = (1.0, 1.0)
     warnings: list[str] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
 

@@ -23,7 +23,7 @@ Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
 LONGEST_PX: Final = 2000
-"""Images are looked at with sides of so many pixels at most."""
+"""Images are looked at with sides of so many pixels at most; larger ones than four times that at a quarter of their size."""
 MOST_FEATURES: Final = 4000
 RATIO: Final = 0.8
 LEAST_MATCHES: Final = 15
@@ -68,7 +68,7 @@ def features_of(path: Path, camera: Camera, longest_px: int = LONGEST_PX) -> Fea
     CaptureError
         It cannot be read, or is of another size than the camera.
     """
-    plane, size = gray(path, longest_px)
+    plane, size = gray(path, max(longest_px, max(camera.width_px, camera.height_px) // 4))
     # without precise upscaling OpenCV's features lie a quarter of a pixel off
     sift = cv2.SIFT.create(
         nfeatures=0, contrastThreshold=0.02, edgeThreshold=12.0, sigma=1.6, enable_precise_upscale=True

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError, UsageError
-from groundproc.imagery import assembly, flown, gate, hybrid, located, results
+from groundproc.imagery import assembly, flown, gate, hybrid, lasting, located, results
 from groundproc.imagery.assembly import Assembled, Known
 from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.screen import Adjusted, adjust
@@ -115,14 +115,28 @@ def _adjusted(
     if session.trajectory is not None:
         mounting, more["held_out"] = gate.accepted(block, known)
         block = replace(block, mounting=mounting)
-        adjusted = adjust(_renewed(block), known, matched, told)
-        adjusted = _with_clocks(session, adjusted, known, matched, told)
+        adjusted = _settled(session, _renewed(block), known, matched, told)
+        more["lasting"] = {
+            name: float(np.median(value)) for name, value in zip(("place", "turn"), session.lasting, strict=True)
+        }
     if surface is not None:
         for _ in range(2):
             adjusted = adjust(held_to(adjusted.solved.block, surface), known, matched, told)
         if session.trajectory is not None:
             adjusted = _with_clocks(session, adjusted, known, matched, told)
     return adjusted, more
+
+
+def _settled(session: Session, block: Block, known: tuple[RigCamera, ...], matched: Mask, told: Any) -> Adjusted:
+    """Adjusted with the trajectory's errors as long as they last: the block is first held loosely, and tells."""
+    assert session.trajectory is not None
+    loose = replace(block, priors=lasting.loosened(block.priors, lasting.LOOSE, lasting.LOOSE))
+    session.lasting = (lasting.LOOSE, lasting.LOOSE)
+    first = _with_clocks(session, adjust(loose, known, matched, told), known, matched, told).solved.block
+    stated = flown.resampled(session.trajectory, first)
+    session.lasting = lasting.factors(stated, stated.priors)
+    block = replace(stated, priors=lasting.loosened(stated.priors, *session.lasting))
+    return _with_clocks(session, adjust(block, known, matched, told), known, matched, told)
 
 
 def _renewed(block: Block) -> Block:
@@ -135,14 +149,18 @@ def _with_clocks(
 ) -> Adjusted:
     """Observed poses taken anew where the clocks have moved."""
     assert session.trajectory is not None
-    before = np.array([one.timeshift_s for one in known])
+    before: npt.NDArray[np.float64] | None = None
     for _ in range(_MOST_ROUNDS):
         block = adjusted.solved.block
         now = np.array([one.timeshift_s for one in block.rig.cameras])
-        if np.abs(now - before).max() < _SETTLED_S:
+        if np.array_equal(now, [one.timeshift_s for one in known]) or (
+            before is not None and np.abs(now - before).max() < _SETTLED_S
+        ):
             break
         before = now
-        adjusted = adjust(flown.resampled(session.trajectory, block), known, matched, told)
+        block = flown.resampled(session.trajectory, block)
+        block = replace(block, priors=lasting.loosened(block.priors, *session.lasting))
+        adjusted = adjust(block, known, matched, told)
     return adjusted
 
 

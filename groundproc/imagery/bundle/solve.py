@@ -81,29 +81,45 @@ def solve(
     now, damping = cost(block, known, unknowns), _FIRST_DAMPING
     settled, number = False, 0
     for number in range(1, most_steps + 1):
-        normal = normal_of(block, known, unknowns, damping)
-        while True:
-            trial = _stepped(block, normal, damping)
-            after = np.inf if trial is None else cost(trial, known, unknowns)
-            if after <= now * (1.0 + 1e-12):
-                break
-            damping *= 10.0
-            if damping > _MOST_DAMPING:
-                break
-            normal = normal_of(block, known, unknowns, damping)
-        if trial is None or after > now * (1.0 + 1e-12):
-            if trial is None:
-                raise CoverageError(_undetermined(block, unknowns, normal.matrix))
+        trial, after, damping = _descend(block, known, unknowns, now, damping)
+        if trial is None:
             settled = True
             break
         gained, block, now = now - after, trial, after
         if progress is not None:
             progress(number, now)
-        damping = max(damping / 10.0, _LEAST_DAMPING)
         if gained <= SETTLED * max(now, 1e-12):
-            settled = True
-            break
+            if damping == 0.0:
+                settled = True
+                break
+            # what little damping there is holds the soft modes of a block: the bend of a strip costs next to nothing
+            damping = 0.0
+        else:
+            damping = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
     return Solved(block, unknowns, known, now, number, settled)
+
+
+def _descend(
+    block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns, now: float, damping: float
+) -> tuple[Block | None, float, float]:
+    """A step that does not raise the sum of squares, the sum after it and the damping that it took; None where there is none.
+
+    Raises
+    ------
+    CoverageError
+        However much it is damped, the normal matrix is singular.
+    """
+    while True:
+        normal = normal_of(block, known, unknowns, damping)
+        trial = _stepped(block, normal, damping)
+        after = np.inf if trial is None else cost(trial, known, unknowns)
+        if after <= now * (1.0 + 1e-12):
+            return trial, after, damping
+        damping = max(10.0 * damping, _LEAST_DAMPING)
+        if damping > _MOST_DAMPING:
+            if trial is None:
+                raise CoverageError(_undetermined(block, unknowns, normal.matrix))
+            return None, now, damping
 
 
 @dataclass(frozen=True, slots=True)

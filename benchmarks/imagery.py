@@ -1,0 +1,125 @@
+"""Images: the adjustment against the reports of an independent one, and on a simulated flight with known truth.
+
+The blocks of the reports lie in the folder that SWATH_RECORDINGS names. The last line is one JSON object.
+"""
+
+import json
+import os
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+import pyproj
+
+from flightlog import frames
+from groundproc.imagery import work
+from groundproc.imagery.rig import read_rig
+from groundproc.imagery.rotations import STRAIGHT_DOWN
+from groundproc.imagery.session import Task
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "helpers"))
+
+import dbat  # noqa: E402
+import imageblock  # noqa: E402
+
+Array = npt.NDArray[np.float64]
+
+
+def quiet(stage: str, count: float) -> None:
+    """No progress."""
+    del stage, count
+
+
+def reports(folder: Path) -> dict[str, Any]:
+    """The two blocks of the Damped Bundle Adjustment Toolbox."""
+    data = Path(os.environ["SWATH_RECORDINGS"]) / "images"
+    figures: dict[str, Any] = {}
+    for name, write in (("sxb", dbat.write_sxb), ("roma", dbat.write_roma)):
+        own = folder / name
+        own.mkdir()
+        write(data / f"dbat_{name}", own)
+        control = own / "control.csv" if name == "sxb" else None
+        task = Task(
+            own / "out", rig=own / "rig.yaml", image_points=own / "points.csv", start=own / "start.csv", control=control
+        )
+        begun = time.monotonic()
+        figures[f"{name}_sigma0"] = round(work.run(task, quiet)["sigma0"], 6)
+        if name == "roma":
+            figures["roma_seconds"] = round(time.monotonic() - begun, 1)
+    return figures
+
+
+def cloud(path: Path) -> None:
+    """The ground of the simulated flight as a lidar sees it."""
+    rng = np.random.default_rng(3)
+    plan = np.column_stack([rng.uniform(-40, 150, 400_000), rng.uniform(-40, 140, 400_000)])
+    points = imageblock.site().map(np.column_stack([plan, imageblock.relief(plan) + rng.normal(0, 0.02, len(plan))]))
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(points.min(axis=0))
+    header.add_crs(pyproj.CRS.from_epsg(32633))
+    record = laspy.LasData(header)
+    record.x, record.y, record.z = points.T
+    record.write(path)
+
+
+def simulated(folder: Path, seed: int) -> dict[str, list[Array]]:
+    """Errors at check points with and without lidar, and of the boresight; points measured to half a pixel, GNSS to 2/2/3 cm."""
+    truth = imageblock.true_camera(line_delay_s=2e-5)
+    flown = imageblock.fly(truth, seed=seed)
+    trajectory = imageblock.disturbed(flown, seed + 5, np.array([0.02, 0.02, 0.03]), np.array([0.05, 0.05, 0.1]))
+    lens = replace(truth.camera, focal_px=1310.0, centre_px=(799.5, 599.5), coefficients=(-0.04, 0.01))
+    guess = replace(
+        truth, camera=lens, mat_cam_ins=STRAIGHT_DOWN.copy(), origin_cam_m=-STRAIGHT_DOWN @ np.array([0.05, 0.10, -0.08]),
+        timeshift_s=0.0, estimate=("f", "pu", "pv", "k1", "k2"), sigma={"f": 20.0, "pu": 10.0, "pv": 10.0},
+    )  # fmt: skip
+    imageblock.write_block(flown, folder, guess, trajectory, 0.5, seed + 9)
+    cloud(folder / "cloud.laz")
+    found: dict[str, list[Array]] = {"with": [], "without": [], "boresight": []}
+    for name, surface in (("without", None), ("with", folder / "cloud.laz")):
+        out = folder / name
+        told = work.run(
+            Task(
+                out, trajectory=folder / "trajectory.csv", rig=folder / "rig.yaml", image_points=folder / "points.csv",
+                control=folder / "control.csv", times=folder / "times.csv", cloud=surface,
+            ),
+            quiet,
+        )  # fmt: skip
+        found[name] = [np.array([[one["dx"], one["dy"], one["dz"]] for one in told["check"]])]
+        camera = read_rig(out / "rig.yaml").cameras[0]
+        turn = frames.quat_log(frames.quat_from_mat(camera.mat_cam_ins @ truth.mat_cam_ins.T))
+        found["boresight"] = [np.rad2deg(turn)]
+    return found
+
+
+def main() -> None:
+    """Measure."""
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        if "SWATH_RECORDINGS" in os.environ:
+            figures |= reports(folder)
+        errors: dict[str, list[Array]] = {"with": [], "without": [], "boresight": []}
+        for seed in range(4):
+            own = folder / f"seed{seed}"
+            own.mkdir()
+            for name, values in simulated(own, seed).items():
+                errors[name] += values
+    lidar, plain = (np.concatenate(errors[name]) for name in ("with", "without"))
+    figures |= {
+        "check_xy_m": round(float(np.sqrt(np.mean(lidar[:, :2] ** 2))), 4),
+        "check_z_m": round(float(np.sqrt(np.mean(lidar[:, 2] ** 2))), 4),
+        "check_z_without_lidar_m": round(float(np.sqrt(np.mean(plain[:, 2] ** 2))), 4),
+        "boresight_error_deg": round(float(np.sqrt(np.mean(np.square(errors["boresight"])))), 4),
+    }
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
