@@ -31,8 +31,10 @@ NAMES: Final[Mapping[str, tuple[str, ...]]] = {
     "incidence": ("incidence",),
     "sigma": ("sigma_h", "sigma_v"),
     "classes": ("classification", "mixed"),
+    "strip": ("point_source_id",),
 }
 """What can be asked for, and the columns that it fills."""
+_LAST_LINE: Final = 65535
 _OF_SURROUNDINGS: Final = frozenset({"incidence", "classes"})
 
 
@@ -46,12 +48,15 @@ class Scene:
     mount : Mount
     mount_errors : MountErrors
     ranging : Ranging
+    line_begins_ns : ndarray of int64, shape (k,)
+        When each flight line but the first begins.
     """
 
     trajectory: Trajectory
     mount: Mount
     mount_errors: MountErrors
     ranging: Ranging
+    line_begins_ns: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 def wanted(names: tuple[str, ...] | None) -> frozenset[str]:
@@ -195,6 +200,9 @@ def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known:
     slant = None
     if "scan_angle" in names:
         columns["scan_angle"] = beams.scan_angle_deg(points.xyz_m, points.time_ns, origins)
+    if "strip" in names:
+        line = np.searchsorted(scene.line_begins_ns, points.time_ns, side="right") + 1
+        columns["point_source_id"] = np.minimum(line, _LAST_LINE).astype(np.uint16)
     if known is not None:
         voxel = known.around.of(points.xyz_m)
         slant = known.around.incidence_deg(points.xyz_m, origins, voxel)

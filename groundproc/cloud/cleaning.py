@@ -44,10 +44,10 @@ _CLEAR: Final = 4
 """What moves hides what is behind it, a pane does not: of so many looks that hit it, one may go through it too, beside an edge."""
 _STAYS: Final = 3
 """What was hit in so many looks and more for each one through it stays where it is."""
-MOST_CONTRADICTED: Final = 0.05
+MOST_CONTRADICTED: Final = 0.03
 """Share of the voxels that may be contradicted: among cars and people it is one in a hundred."""
 STAYS_MS: Final = 2000
-MOST_STAYED: Final = 0.01
+MOST_STAYED: Final = 0.002
 """Share of the points that may be contradicted and in voxels hit for so long: where a path comes back beside itself, whole walls are."""
 _METRE: Final = 2
 _FOUR_METRES: Final = 4

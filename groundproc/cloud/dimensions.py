@@ -143,7 +143,7 @@ TABLE: Final = (
     ),
     Dimension("user_data", "u1", "user data", "What another program used it for.", "other programs", field="user_data"),
     Dimension(
-        "point_source_id", "u2", "point source", "The flight line or file that the point is from.", "other programs",
+        "point_source_id", "u2", "point source", "The flight line that the point is from, counted from 1; or the file.", "attributes",
         field="point_source_id",
     ),
     Dimension("red", "u2", "red", "Colour, 0 to 65535.", "`swath colour`", field="red"),

@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 Ints = npt.NDArray[np.int32]
 
-EVERY: Final = 3
+EVERY: Final = 5
 """Of so many shots one is looked along; no multiple of the lasers, so that each has its turn."""
 BEGIN_M: Final = 1.0
 BEYOND_M: Final = 0.6

@@ -29,6 +29,8 @@ from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
+from groundproc.strips.cutting import line_begins_ns
+from groundproc.strips.options import StripOptions
 from groundproc.survey import AttributeSettings, PlacingSettings, Survey, section
 from groundproc.trajectory.estimate import Estimate
 
@@ -98,7 +100,8 @@ def work(run: Run, folders: Folders) -> None:
         return placing.placed(seen, made.trajectory, made.mount)
 
     found = attributes.Found()
-    scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging)
+    lines = line_begins_ns(made.trajectory, StripOptions().turn_deg)
+    scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging, lines)
     with contextlib.ExitStack() as stack:
         sinks: list[Making] = []
         for each in chosen(survey.products):

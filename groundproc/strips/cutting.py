@@ -11,6 +11,7 @@ from scipy.signal import find_peaks
 
 from flightlog import frames
 from groundproc.strips.route import Route
+from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -116,36 +117,45 @@ class Occupancy:
         return None, "turns"
 
     def _turns(self, turn_deg: float) -> Ints:
-        """Bins in the middle of turns."""
-        poses = self.route.poses
-        bins = len(self.points)
-        times = self.start_ns + np.arange(bins) * BIN_NS
-        place = np.clip(np.searchsorted(poses.time_ns, times), 0, len(poses) - 1)
-        per_s = 1e9 / BIN_NS
-        velocity = gaussian_filter1d(poses.velocity_m_s[place, :2], per_s, axis=0, mode="nearest")
-        course = np.arctan2(velocity[:, 0], velocity[:, 1])
-        fast = np.hypot(velocity[:, 0], velocity[:, 1]) > _SLOWEST_M_S
-        if not fast.any():
-            return np.zeros(0, np.int64)
-        course = course[np.maximum.accumulate(np.where(fast, np.arange(bins), np.argmax(fast)))]
-        half = int(WINDOW_S / 2 * per_s)
-        course = np.unwrap(course)
-        padded = np.pad(course, half, mode="edge")
-        change = np.abs(padded[2 * half :] - padded[: -2 * half])
-        cuts, _ = find_peaks(change, height=np.deg2rad(turn_deg), prominence=np.deg2rad(turn_deg) / 4, distance=half)
-        found = cuts.tolist()
-        # a wide turn or a circle has no peak: what turns in its inner part is cut where the course is half-way
-        left = list(itertools.pairwise([0, *found, bins - 1]))
-        while left:
-            start, end = left.pop()
-            low, high = start + (end - start) // 5, end - (end - start) // 5
-            turned = np.abs(course[low : high + 1] - course[low])
-            if end - start < half or turned[-1] < _WIDE_RAD:
-                continue
-            middle = low + int(np.argmax(turned >= 0.5 * turned[-1]))
-            found.append(middle)
-            left += [(start, middle), (middle, end)]
-        return np.array(sorted(found), np.int64)
+        return turns(self.route.poses, self.start_ns, len(self.points), turn_deg)
+
+
+def line_begins_ns(trajectory: Trajectory, turn_deg: float) -> Ints:
+    """Times [ns], shape (k,), at which another flight line begins: the middle of each turn, as strips are cut; the first line has none."""
+    start_ns = int(trajectory.time_ns[0])
+    bins = int((trajectory.time_ns[-1] - start_ns) // BIN_NS) + 1
+    return np.asarray(start_ns + BIN_NS * turns(trajectory, start_ns, bins, turn_deg))
+
+
+def turns(poses: Trajectory, start_ns: int, bins: int, turn_deg: float) -> Ints:
+    """Bins in the middle of turns, of so many from a time on."""
+    times = start_ns + np.arange(bins) * BIN_NS
+    place = np.clip(np.searchsorted(poses.time_ns, times), 0, len(poses) - 1)
+    per_s = 1e9 / BIN_NS
+    velocity = gaussian_filter1d(poses.velocity_m_s[place, :2], per_s, axis=0, mode="nearest")
+    course = np.arctan2(velocity[:, 0], velocity[:, 1])
+    fast = np.hypot(velocity[:, 0], velocity[:, 1]) > _SLOWEST_M_S
+    if not fast.any():
+        return np.zeros(0, np.int64)
+    course = course[np.maximum.accumulate(np.where(fast, np.arange(bins), np.argmax(fast)))]
+    half = int(WINDOW_S / 2 * per_s)
+    course = np.unwrap(course)
+    padded = np.pad(course, half, mode="edge")
+    change = np.abs(padded[2 * half :] - padded[: -2 * half])
+    cuts, _ = find_peaks(change, height=np.deg2rad(turn_deg), prominence=np.deg2rad(turn_deg) / 4, distance=half)
+    found = cuts.tolist()
+    # a wide turn or a circle has no peak: what turns in its inner part is cut where the course is half-way
+    left = list(itertools.pairwise([0, *found, bins - 1]))
+    while left:
+        start, end = left.pop()
+        low, high = start + (end - start) // 5, end - (end - start) // 5
+        turned = np.abs(course[low : high + 1] - course[low])
+        if end - start < half or turned[-1] < _WIDE_RAD:
+            continue
+        middle = low + int(np.argmax(turned >= 0.5 * turned[-1]))
+        found.append(middle)
+        left += [(start, middle), (middle, end)]
+    return np.array(sorted(found), np.int64)
 
 
 def headings_differ(route: Route, strips: Strips) -> float:

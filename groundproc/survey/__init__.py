@@ -150,7 +150,7 @@ class AttributeSettings:
 
     attributes: tuple[str, ...] | None = setting(
         None,
-        "what is found out of each point: scan_angle, incidence, sigma, classes; see docs/attributes.md",
+        "what is found out of each point: scan_angle, incidence, sigma, classes, strip; see docs/attributes.md",
         words=("--attributes",),
         metavar="NAMES",
         reads="names",

@@ -1,6 +1,7 @@
 """Planes around points, and the passes over a flight that find them."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -144,6 +145,13 @@ def test_points_come_in_their_order_whatever_the_stretches(monkeypatch: pytest.M
             if len(some):
                 assert set(some.columns) == {"range", *(name for each in attributes.NAMES.values() for name in each)}
                 assert np.isfinite(some["incidence"]).mean() > 0.95
+
+
+def test_points_of_a_flight_line_have_its_number() -> None:
+    lines = replace(scene(), line_begins_ns=START_NS + np.array([5, 12]) * 10**9)
+    found = list(attributes.described(stream, lines, attributes.wanted(("strip",))))
+    told = [np.unique(some["point_source_id"]).tolist() for some in found if len(some)]
+    assert told == [[1]] * 4 + [[2]] * 7 + [[3]] * 8
 
 
 def test_what_needs_no_surroundings_takes_one_pass() -> None:
