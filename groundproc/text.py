@@ -7,7 +7,7 @@ nobody can tell 1,234 from 1.234.
 import csv
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,7 +133,9 @@ class Table:
         return f"{_shown(words)} found, expected {expected}"
 
 
-def table_of(file: TextIO, place: str, wanted: str, error: type[SwathError], expected: str) -> Table:
+def table_of(
+    file: TextIO, place: str, wanted: str | Collection[str] | int, error: type[SwathError], expected: str
+) -> Table:
     """The line of names of a table; its rows follow.
 
     Parameters
@@ -142,8 +144,8 @@ def table_of(file: TextIO, place: str, wanted: str, error: type[SwathError], exp
         At its beginning.
     place : str
         Name of the file, for errors.
-    wanted : str
-        A column that must be there: the separator is the one that finds it.
+    wanted : str, collection of str, or int
+        A column that must be there, or one of several, or how many columns: the separator is the one that finds it.
     error : type of SwathError
         What to raise.
     expected : str
@@ -162,14 +164,22 @@ def table_of(file: TextIO, place: str, wanted: str, error: type[SwathError], exp
         if (found := names_of(line, wanted)) is not None:
             return Table(found[0], found[1], place, error, file, number)
         break
-    raise error(f"{place}: the first line has no column {wanted}; {expected}")
+    if isinstance(wanted, int):
+        raise error(f"{place}: the first line does not name {wanted} columns; {expected}")
+    named = wanted if isinstance(wanted, str) else next(iter(wanted))
+    raise error(f"{place}: the first line has no column {named}; {expected}")
 
 
-def names_of(line: str, wanted: str) -> tuple[list[str], str | None] | None:
-    """Names in the first line of a table, and its separator; None where a column is not among them."""
+def names_of(line: str, wanted: str | Collection[str] | int) -> tuple[list[str], str | None] | None:
+    """Names in the first line of a table, and its separator; None where what is wanted is not among them."""
     for separator in (*_SEPARATORS, None):
         names = [name.strip().lstrip("#").strip() for name in _split(line, separator)]
-        if wanted in names or wanted in (name.lower() for name in names):
+        if isinstance(wanted, int):
+            found = len(names) == wanted
+        else:
+            several = {wanted} if isinstance(wanted, str) else set(wanted)
+            found = not several.isdisjoint(names) or not several.isdisjoint(name.lower() for name in names)
+        if found:
             return names, separator
     return None
 

@@ -1,6 +1,6 @@
 """A cloud against surveyed points: the surface at each, the nearest point, or the centre of a target."""
 
-import csv
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from flightlog.errors import CaptureError
 from groundproc.assessment.surface import RADII_M, patch_at
 from groundproc.cloud import reader
+from groundproc.text import Table, open_text, table_of
 
 Array = npt.NDArray[np.float64]
 
@@ -23,6 +24,7 @@ _NAMES: Final = {
     "z": ("z", "h", "height", "elevation", "up"),
 }  # fmt: skip
 REACH_M: Final = RADII_M[-1]
+_FARTHEST_M: Final = 1e8
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,38 +79,35 @@ def read_points(path: Path) -> tuple[CheckPoint, ...]:
         It cannot be read, a column is missing, or a line is no point.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(word.strip() for word in row)]
+        with open_text(path) as file:
+            table = table_of(file, str(path), _NAMES["x"], CaptureError, "expected id,x,y,z")
+            names = [name.lower() for name in table.names]
+            missing = [key for key, words in _NAMES.items() if not set(words) & set(names)]
+            if missing:
+                raise CaptureError(f"{path}: the first line has no column {missing[0]}; expected id,x,y,z")
+            column = {key: names.index(next(word for word in words if word in names)) for key, words in _NAMES.items()}
+            points = [_point(table, words, column, number) for number, words in table.rows()]
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
-    except (UnicodeDecodeError, csv.Error):
-        raise CaptureError(f"{path}: is no table of text") from None
-    names = [word.strip().lower() for word in rows[0]] if rows else []
-    column = {}
-    for key, words in _NAMES.items():
-        found = [names.index(word) for word in words if word in names]
-        if not found:
-            raise CaptureError(f"{path}: the first line has no column {key}; expected id,x,y,z")
-        column[key] = found[0]
-    points = [_point(row, column, f"{path}: row {number}") for number, row in enumerate(rows[1:], 2)]
     if not points:
         raise CaptureError(f"{path}: holds no points")
-    doubled = next((each.id for n, each in enumerate(points) if each.id in {p.id for p in points[:n]}), None)
+    counted = Counter(point.id for point in points)
+    doubled = next((name for name, count in counted.items() if count > 1), None)
     if doubled is not None:
         raise CaptureError(f"{path}: point {doubled!r} stands there twice, expected each once")
     return tuple(points)
 
 
-def _point(row: Sequence[str], column: dict[str, int], place: str) -> CheckPoint:
+def _point(table: Table, row: Sequence[str], column: dict[str, int], number: int) -> CheckPoint:
+    """What one line says."""
     try:
         where = np.array([float(row[column[axis]]) for axis in "xyz"])
-        name = row[column["id"]].strip()
-    except (ValueError, IndexError):
-        where, name = np.full(3, np.nan), ""
-    if not np.isfinite(where).all() or not name:
-        raise CaptureError(
-            f"{place}: {','.join(row)!r} found, expected an id and x, y, z as numbers with a decimal point"
-        )
+    except ValueError:
+        where = np.full(3, np.nan)
+    name = row[column["id"]].strip()
+    if not (np.abs(where) <= _FARTHEST_M).all() or not name:
+        expected = "an id and x, y, z as numbers with a decimal point"
+        raise CaptureError(f"{table.place}: line {number}: {table.blame(row, expected)}")
     return CheckPoint(name, where)
 
 

@@ -1,15 +1,19 @@
 """Two sets of coordinates of the same points, by id, in one table."""
 
-import csv
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError
+from groundproc.text import open_text, table_of
 
 Array = npt.NDArray[np.float64]
+
+_FARTHEST_M: Final = 1e8
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,29 +40,31 @@ def read_pairs(path: Path) -> Pairs:
     CaptureError
         It cannot be read, or a line is not so.
     """
+    ids: list[str] = []
+    values = []
+    expected = "expected a line of 7 names (id, x, y, z, x, y, z) and a line for each point below it"
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(word.strip() for word in row)]
+        with open_text(path) as file:
+            table = table_of(file, str(path), 7, CaptureError, expected)
+            for number, row in table.rows():
+                ids.append(row[0].strip())
+                values.append(_numbers(row[1:]))
+                if not (np.abs(values[-1]) <= _FARTHEST_M).all():
+                    raise CaptureError(f"{path}: line {number}: {table.blame(row, 'an id and six numbers')}")
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
-    except (UnicodeDecodeError, csv.Error):
-        raise CaptureError(f"{path}: is no table of text") from None
-    if len(rows) < 2 or len(rows[0]) != 7:
-        raise CaptureError(
-            f"{path}: expected a line of 7 names (id, x, y, z, x, y, z) and a line for each point below it"
-        )
-    ids, values = [], []
-    for number, row in enumerate(rows[1:], 2):
-        try:
-            numbers = [float(word) for word in row[1:]]
-        except ValueError:
-            numbers = []
-        if len(numbers) != 6 or not np.isfinite(numbers).all():
-            raise CaptureError(f"{path}: row {number}: {','.join(row)!r} found, expected an id and six numbers")
-        ids.append(row[0].strip())
-        values.append(numbers)
-    doubled = next((name for name in ids if ids.count(name) > 1), None)
+    if not ids:
+        raise CaptureError(f"{path}: holds no points, {expected}")
+    doubled = next((name for name, count in Counter(ids).items() if count > 1), None)
     if doubled is not None:
         raise CaptureError(f"{path}: point {doubled!r} stands there twice, expected each once")
     both = np.array(values)
     return Pairs(tuple(ids), both[:, :3], both[:, 3:])
+
+
+def _numbers(words: list[str]) -> Array:
+    """Words as numbers, not a number where one is none."""
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError:
+        return np.full(len(words), np.nan)

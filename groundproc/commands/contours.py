@@ -1,6 +1,7 @@
 """`swath contours`: lines of equal height of a terrain or surface model, as GeoPackage, GeoJSON or DXF."""
 
 import argparse
+import sys
 from pathlib import Path
 
 HELP = "draw contours of a raster of heights, to GeoPackage, GeoJSON or DXF"
@@ -37,6 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
         lines = list(contours.contours(raster, arguments.interval, arguments.shortest))
         if not lines:
             raise CoverageError(f"{arguments.raster}: no contour at whole multiples of {arguments.interval:g} m")
+        if raster.crs is None:
+            print(f"swath: warning: {arguments.raster} states no CRS, and so {output} states none", file=sys.stderr)
         with written_aside(output) as aside:
             files.write_contours(aside, output.suffix.lower(), lines, raster.crs)
     print(f"{len(lines)} contours of {lines[0].height_m:g} to {lines[-1].height_m:g} m in {output}")

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 import rasterio
+from rasterio._err import CPLE_BaseError  # what GDAL says where rasterio has no word of its own for it
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy
@@ -23,6 +24,11 @@ from groundproc.raster.grid import Grid, Window
 BLOCK: Final = 512
 NO_DATA: Final = -9999.0
 """Of rasters of floating numbers, as GDAL's own tools have it."""
+_TROUBLE: Final = (RasterioError, CPLE_BaseError, OSError)
+_FARTHEST_M: Final = 1e5
+"""Heights on the earth, in metres or feet, lie well within."""
+_FARTHEST_PLACE_M: Final = 1e8
+_CELL_M: Final = 1e-3, 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +93,8 @@ def write(
     if crs is not None:
         profile["crs"] = rasterio.crs.CRS.from_wkt(crs.to_wkt("WKT2_2019"))
     try:
-        with rasterio.open(plain, "w", **profile) as file:
+        # a corner of 0, 0 and cells of 1 m are a place as good as any
+        with _georeferenced_or_not(), rasterio.open(plain, "w", **profile) as file:
             file.update_tags(TIFFTAG_SOFTWARE=f"swath {__version__}")
             _describe(file, bands)
             for window in grid.blocks(BLOCK):
@@ -100,11 +107,19 @@ def write(
             plain, path, driver="COG", compress="DEFLATE", predictor=predictor, blocksize=BLOCK,
             overview_resampling=bands[0].resampling, bigtiff="IF_SAFER", num_threads="ALL_CPUS",
         )  # fmt: skip
-    except (RasterioError, OSError) as error:
+    except _TROUBLE as error:
         raise SourceError(f"{path}: cannot be written ({_sentence(error)})") from None
     finally:
         with contextlib.suppress(OSError):
             plain.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _georeferenced_or_not() -> Iterator[None]:
+    """Without rasterio's warning: what a place has to be, is said here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        yield
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +156,16 @@ class Raster:
             read = self.file.read(
                 1, window=_window(self.grid, window), boundless=True, masked=True, out_dtype="float32"
             )
-        except (RasterioError, OSError) as error:
+        except _TROUBLE as error:
             raise CaptureError(f"{self.path}: is damaged ({_sentence(error)})") from None
-        return np.asarray(read.filled(np.nan), np.float32)
+        found = np.asarray(read.filled(np.nan), np.float32)
+        largest = float(np.abs(found[np.isfinite(found)]).max(initial=0.0))
+        if largest > _FARTHEST_M or np.isinf(found).any():
+            raise CaptureError(
+                f"{self.path}: values such as {largest:g} found, expected heights within {_FARTHEST_M:g} m; does it not state which "
+                "value stands for none?"
+            )
+        return found
 
 
 def coarse(raster: Raster, most: int) -> tuple[npt.NDArray[np.float32], float]:
@@ -163,7 +185,7 @@ def coarse(raster: Raster, most: int) -> tuple[npt.NDArray[np.float32], float]:
         read = raster.file.read(
             1, out_shape=shape, masked=True, out_dtype="float32", resampling=rasterio.enums.Resampling.average
         )
-    except (RasterioError, OSError) as error:
+    except _TROUBLE as error:
         raise CaptureError(f"{raster.path}: is damaged ({_sentence(error)})") from None
     return np.asarray(read.filled(np.nan), np.float32), grid.cell_m * step
 
@@ -178,16 +200,20 @@ def opened(path: Path) -> Iterator[Raster]:
         It cannot be read, is no raster, or its cells are not square or are turned.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with _georeferenced_or_not():
             file = rasterio.open(path)
-    except (RasterioError, OSError) as error:
+    except _TROUBLE as error:
         raise CaptureError(f"{path}: cannot be read as a raster ({_sentence(error)})") from None
     with file:
         transform = file.transform
         if transform.is_identity or transform.b or transform.d or not np.isclose(transform.a, -transform.e, rtol=1e-6):
             raise CaptureError(f"{path}: cells of {transform.a:g} x {-transform.e:g} found, expected squares, north up")
         cell_m = float(transform.a)
+        if not (_CELL_M[0] <= cell_m <= _CELL_M[1] and max(abs(transform.c), abs(transform.f)) <= _FARTHEST_PLACE_M):
+            raise CaptureError(
+                f"{path}: cells of {cell_m:g} m at {transform.c:g}, {transform.f:g} found, expected {_CELL_M[0]:g} to {_CELL_M[1]:g} m "
+                "in a projected CRS"
+            )
         column, row = round(transform.c / cell_m), round(transform.f / cell_m) - file.height
         crs = None if file.crs is None else pyproj.CRS.from_wkt(file.crs.to_wkt())
         grid = Grid(column, row, file.width, file.height, cell_m)

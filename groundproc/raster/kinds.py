@@ -147,6 +147,11 @@ def names() -> tuple[str, ...]:
     return (*(each.name for each in KINDS), *(each.name for each in TABLE if each.name not in {k.name for k in KINDS}))
 
 
+_ROOM_CELLS: Final = 10_000_000
+_ROOM_EACH: Final = 1000
+"""So many cells, and so many more a point, a raster may have: a corridor across its bounding box has some 40, a stray point millions."""
+
+
 class Gathering:
     """A raster of one kind, gathered from points in any order.
 
@@ -164,12 +169,13 @@ class Gathering:
     """
 
     def __init__(self, kind: Kind, cell_m: float, folder: Path) -> None:
-        self._kind, self._cell_m = kind, checked_cell(cell_m)
+        self._kind, self._cell_m, self._points = kind, checked_cell(cell_m), 0
         median = kind.statistic == "median"
         self._cells: Cells | Medians = Medians(cell_m, folder) if median else Cells(cell_m, {kind.statistic})
 
     def add(self, points: Points) -> None:
         """Take points."""
+        self._points += len(points)
         self._cells.add(points.xyz_m, self._kind.values(points))
 
     def write(self, path: Path, crs: pyproj.CRS | None) -> None:
@@ -178,13 +184,19 @@ class Gathering:
         Raises
         ------
         CoverageError
-            No point had a value.
+            No point had a value, or a few lie far from all others.
         SourceError
             It cannot be written.
         """
         grid = self._cells.grid()
         if grid is None:
             raise CoverageError(f"{path.name}: not one point has a value of {self._kind.column}")
+        if grid.columns * grid.rows > _ROOM_CELLS + _ROOM_EACH * self._points:
+            raise CoverageError(
+                f"{path.name}: {self._points:,} points lie within {grid.columns * self._cell_m:,.0f} x {grid.rows * self._cell_m:,.0f} m, "
+                f"{grid.columns * grid.rows:,} cells, nearly all empty; are some of the points strays? leave these out, or take larger "
+                "cells"
+            )
         geotiff.write(path, grid, crs, self._kind.band, self._block)
 
     def _block(self, window: Window) -> npt.NDArray[Any]:

@@ -1,5 +1,6 @@
 """A full disk and a signal in the middle of the work: one sentence, the right exit code, nothing left; real disks (tmpfs, root)."""
 
+import gzip
 import os
 import shutil
 import signal
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import seeds
 
 from flightlog.logfile import LogReader
 from groundproc.cli import main
@@ -28,6 +30,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_flight(folder / "a.mcap", 4.0)
     content = (folder / "a.mcap").read_bytes()
     (folder / "cut.mcap").write_bytes(content[: len(content) * 4 // 5])
+    (folder / "a.pcap").write_bytes(seeds.pcap(1000))
+    (folder / "a.tlog.gz").write_bytes(gzip.compress(seeds.tlog() * 500))
     assert main(["process", str(folder / "a.mcap"), "-o", str(folder / "out"), "--method", "ins"]) in (0, 3)
     return folder
 
@@ -59,6 +63,9 @@ COMMANDS: dict[str, tuple[list[str], int]] = {
     "process, the cloud": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 1500),
     "process, the first step": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 16),
     "adjust": (["adjust", "IN/out/cloud.laz", "-t", "IN/out/trajectory.csv", "-o", "DISK/new/out"], 256),
+    "import": (["import", "--pcap", "IN/a.pcap", "-o", "DISK/new/a.mcap"], 64),
+    "import, packed": (["import", "--pcap", "IN/a.pcap", "--mavlink", "IN/a.tlog.gz", "-o", "DISK/new/a.mcap"], 16),
+    "calibrate": (["calibrate", "IN/a.mcap", "-o", "DISK/new/out"], 0),
     "init": (["init", "IN/a.mcap", "-o", "DISK/new/survey.yaml"], 0),
     "simulate": (["simulate", "--dark", "--duration", "2", "-o", "DISK/new"], 256),
     "live": (["live", "--follow", "IN/a.mcap", "--port", "0", "--idle", "3", "-o", "DISK/new"], 0),

@@ -9,13 +9,15 @@ import signal
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from unittest import mock
 
+import farther
 import seeds
+from door import Door, Made, spoilt
 
 from flightlog.errors import SwathError
 from groundproc.cli import main
@@ -28,36 +30,9 @@ CPU_S = 15
 _ALLOWED = re.compile(r"[^\x00-\x09\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ufeff]*")
 """Text in lines: no controls, nothing invisible, nothing that changes the direction."""
 
-Made = Callable[[random.Random], bytes]
-
 
 class TooLongError(Exception):
     """A command did not end."""
-
-
-@dataclass(frozen=True)
-class Door:
-    """A command with one spoilt file.
-
-    Attributes
-    ----------
-    name : str
-    file : str
-        Name that the spoilt file gets.
-    words : tuple of str
-        {file} is the spoilt one, {out} the output, {good} a folder with good files.
-    made : tuple of callables
-        Each makes the bytes of a spoilt file.
-    """
-
-    name: str
-    file: str
-    words: tuple[str, ...]
-    made: tuple[Made, ...]
-
-
-def spoilt(data: bytes) -> Made:
-    return lambda dice: seeds.mutated(data, dice)
 
 
 def doors() -> list[Door]:
@@ -114,6 +89,7 @@ def doors() -> list[Door]:
         ),
         Door("control", "c.csv", (*strips, "--control", "{file}"), (spoilt(seeds.control()),)),
         Door("options", "o.yaml", (*strips, "--config", "{file}"), (spoilt(seeds.OPTIONS),)),
+        *farther.doors(),
     ]  # fmt: skip
 
 
@@ -125,6 +101,7 @@ def good_files(folder: Path) -> None:
         ("a.laz", seeds.cloud("laz", 6)), ("t.csv", seeds.trajectory()),
     ):  # fmt: skip
         seeds.write(folder, name, data)
+    farther.good_files(folder)
 
 
 @dataclass
@@ -142,7 +119,7 @@ def run(folder: Path, seed: int, go_on: Callable[[int], bool], chosen: list[Door
     good_files(folder / "good")
     (folder / "kept").mkdir(exist_ok=True)
     every = chosen or doors()
-    with mock.patch.object(work, "_survey", _all_read):
+    with mock.patch.object(work, "_survey", _all_read), farther.readers_only():
         while go_on(found.cases):
             door = every[found.cases % len(every)]
             place = folder / "case"
@@ -179,16 +156,25 @@ def ask(door: Door, file: Path, good: Path) -> tuple[str, int]:
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("error")
-            code = main(words)
+            warnings.filterwarnings(
+                "ignore", "Use `@` matmul", PendingDeprecationWarning
+            )  # rasterio 1.4 with affine 3.1
+            with farther.aircraft(file):
+                code = main(words)
     except SystemExit as error:
         code = int(error.code or 0)
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__} in {Path(where.filename).name}: {where.name}: {str(error)[:80]!r}", code
-    return _judged(said.getvalue(), code, file), code
+    return _judged(said.getvalue(), code, () if door.keeps else _left(file)), code
 
 
-def _judged(text: str, code: int, file: Path) -> str:
+def _left(file: Path) -> list[str]:
+    """What else is where the file is."""
+    return sorted(path.name for path in file.parent.rglob("*") if path != file)
+
+
+def _judged(text: str, code: int, left: Sequence[str]) -> str:
     """What is wrong with what a command said and left."""
     if code not in CODES:
         return f"exit code {code}"
@@ -199,9 +185,8 @@ def _judged(text: str, code: int, file: Path) -> str:
         return f"{len(text)} characters on the terminal"
     if any(line.startswith("swath: all is well") for line in text.splitlines()):
         return "a forged line on the terminal"
-    left = sorted(path.name for path in file.parent.rglob("*") if path != file)
     if any(".part" in name for name in left) or (code in (1, 2) and left):
-        return f"left {left}"
+        return f"left {list(left)}"
     return ""
 
 

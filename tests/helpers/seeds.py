@@ -124,16 +124,16 @@ def ethernet(payload: bytes, port: int) -> bytes:
     return b"\xff" * 6 + b"\x60\x76\x88\x00\x00\x01" + b"\x08\x00" + ip + udp
 
 
-def frames() -> list[tuple[int, bytes]]:
-    found = [(START_NS + k * STEP_NS, ethernet(packet(k), 2368)) for k in range(12)]
+def frames(packets: int = 12) -> list[tuple[int, bytes]]:
+    found = [(START_NS + k * STEP_NS, ethernet(packet(k), 2368)) for k in range(packets)]
     found += [(START_NS + k * 5_000_000, ethernet(position_packet(k, HOSTILE), 8308)) for k in range(2)]
     found += [(time_ns, ethernet(data, 14550)) for time_ns, data in messages()[:40]]
     return sorted(found)
 
 
-def pcap() -> bytes:
+def pcap(packets: int = 12) -> bytes:
     out = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
-    for time_ns, data in frames():
+    for time_ns, data in frames(packets):
         out += struct.pack("<IIII", time_ns // 10**9, time_ns % 10**9 // 1000, len(data), len(data)) + data
     return out
 

@@ -103,7 +103,9 @@ def _read(path: Path) -> tuple[list[str], npt.NDArray[np.int64], Array]:
         for number, words in rows_of.rows():
             row = _numbers([words[place] for place in places], names)
             if row is None:
-                expected = f"{len(header)} values, utc_ns a whole number and the pose one that can be"
+                expected = (
+                    f"{len(header)} values, utc_ns a whole number, the pose one that can be, and no sigma below 0"
+                )
                 raise LogError(f"{path}: line {number}: {rows_of.blame(words, expected)}")
             stamps.append(row[0])
             rows.append(row[1])
@@ -117,9 +119,10 @@ def _numbers(words: list[str], names: list[str]) -> tuple[int, list[float]] | No
     except ValueError:
         return None
     for name, value in zip(names, values, strict=True):
-        # a sigma may be missing
-        stated = not (name.startswith("sigma") and math.isnan(value))
-        if stated and not abs(value) <= _LARGEST.get(name, 1e9):
+        # a sigma may be missing, and is never below 0
+        is_sigma = name.startswith("sigma")
+        stated = not (is_sigma and math.isnan(value))
+        if stated and not (abs(value) <= _LARGEST.get(name, 1e9) and (value >= 0.0 or not is_sigma)):
             return None
     return stamp, values
 

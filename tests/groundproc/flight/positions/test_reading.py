@@ -11,7 +11,7 @@ import pytest
 from flightlog.errors import LogError, SwathError
 from groundproc.flight.positions.reading import read_solution
 from groundproc.geodesy import LocalFrame
-from groundproc.trajectory.table import from_poses, write_trajectory
+from groundproc.trajectory.table import from_poses, read_trajectory, write_trajectory
 
 POS = (
     "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio\n"
@@ -139,3 +139,22 @@ def test_our_own_trajectory_comes_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.sigma_m, 0.02, atol=1e-9)
     assert found.quat_place_ins_wxyz is not None
     np.testing.assert_allclose(np.abs(np.sum(found.quat_place_ins_wxyz * quat, axis=1)), 1.0, atol=1e-12)
+
+
+def test_a_sigma_below_zero_in_a_table_of_poses_is_named(write: Callable[[bytes], Path]) -> None:
+    """Squared, it would pass for one above zero."""
+    text = POSES.format(cross=0)
+    wrong = text.replace("0.1,0.2,0.3,0.1,0.1,0.2,0,", "0.1,-0.2,0.3,0.1,0.1,0.2,0,")
+    assert wrong != text
+    for read in (read_solution, read_trajectory):
+        with pytest.raises(LogError, match=r"line 2: .*no sigma below 0"):
+            read(write(wrong.encode()))
+
+
+def test_a_variance_below_zero_leaves_the_row_out(write: Callable[[bytes], Path]) -> None:
+    """In geocentric axes no sigma is negative, but turned to east, north and up covariances that are too large make one."""
+    head = "%  GPST  x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) age(s) ratio\n"
+    good = "2300 302400.2 3226000.0 902000.0 5409000.0 1 9 0.03 0.02 0.05 0.0 0.0 0.0 0.0 5.0\n"
+    bad = "2300 302401.2 3226000.0 902000.0 5409000.0 1 9 0.03 0.02 0.05 9.0 9.0 9.0 0.0 5.0\n"
+    found = read_solution(write((head + good + bad).encode()))
+    assert (len(found), found.left_out) == (1, {"impossible": 1})
