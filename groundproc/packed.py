@@ -19,7 +19,7 @@ import zstandard
 
 from flightlog.errors import CaptureError
 
-_EXPANSION: Final = 64
+EXPANSION: Final = 64
 _MOST_BYTES: Final = 64 << 20
 """What is taken in unpacks to so many times its size and so many bytes; telemetry and packets do not reach a tenth of it."""
 _LARGEST_WINDOW: Final = 1 << 27
@@ -40,6 +40,11 @@ _KINDS: Final[tuple[tuple[bytes, str, Callable[[BinaryIO], BinaryIO]], ...]] = (
     (b"\x28\xb5\x2f\xfd", "zstd", _zstd),
     (b"\x04\x22\x4d\x18", "lz4", lambda file: cast(BinaryIO, lz4.frame.LZ4FrameFile(file))),
 )
+
+
+def most_bytes(taken: int) -> int:
+    """To how many bytes so many compressed ones may unpack."""
+    return _MOST_BYTES + EXPANSION * taken
 
 
 def packing(head: bytes) -> str:
@@ -92,9 +97,9 @@ class Unpacking(io.RawIOBase):
             self.damage = f"its {self.kind} data end early or are damaged ({error})"
             return 0
         self._given += len(piece)
-        if self._given > _MOST_BYTES + _EXPANSION * self._packed.taken:
+        if self._given > most_bytes(self._packed.taken):
             raise CaptureError(
-                f"{self._place}: unpacks to more than {_EXPANSION} times its size, which no recording does; unpack it yourself"
+                f"{self._place}: unpacks to more than {EXPANSION} times its size, which no recording does; unpack it yourself"
             )
         buffer[: len(piece)] = piece
         return len(piece)

@@ -19,6 +19,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
 from flightlog.words import clean
 from groundproc import packed, system
+from groundproc.flight.importers import bagunpacking
 from groundproc.flight.importers.inputs import hash_of
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.kinds import BAG, HEAD_BYTES, MCAP, Kind, kind_of
@@ -107,7 +108,11 @@ class Bag:
         self._types = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
         for name, text in _DEFINITIONS.items():
             self._types.register(get_types_from_msg(text, name))
+        bagunpacking.BUDGET.begin()
         with _as_sentence(path, self._damage):
+            for database in [self._content] if self._content.is_file() else sorted(self._content.glob("*.db3")):
+                if database.suffix == ".db3":
+                    bagunpacking.check_tables(database)
             self._reader = rosbag1.Reader(self._content) if self._is_ros1 else rosbag2.Reader(self._content)
             self._reader.open()
             self._connections = [each for each in self._reader.connections if each.msgtype in _READ]
@@ -115,7 +120,11 @@ class Bag:
             others = _what_else(self._reader.connections)
             self.close()
             raise CaptureError(f"{path}: {others}")
-        self._probe()
+        try:
+            self._probe()
+        except CaptureError:
+            self.close()
+            raise
 
     def _probe(self) -> None:
         """Look at the first packets of each topic."""
@@ -206,7 +215,9 @@ class _as_sentence:  # noqa: N801 - a context manager, used as a statement
         pass
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, CaptureError):
+        if isinstance(error, Exception) and not (
+            isinstance(error, CaptureError) and str(error).startswith(str(self._path))
+        ):
             reason = self._damage or clean(" ".join(str(error).split())) or type(error).__name__
             help_is = "; rosbag reindex mends a bag that was not closed" if "index" in reason else ""
             raise CaptureError(f"{self._path}: cannot be read as a bag ({reason}){help_is}") from None

@@ -1,9 +1,11 @@
 """What people bring to `swath import`: bags, compressed files, MAVLink in captures, logs of an autopilot alone."""
 
 import bz2
+import contextlib
 import gzip
 import json
 import lzma
+import sqlite3
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from flightlog import records
 from flightlog.logfile import LogReader
+from groundproc import packed
 from groundproc.cli import main
 
 START_NS = 1_700_000_000_000_000_000
@@ -288,7 +291,7 @@ def test_a_file_that_unpacks_without_end_is_refused(
     assert path.stat().st_size < 1_000_000
     code, said = run(capsys, "--pcap", path, "-o", tmp_path / "b.mcap")
     assert code == 1
-    assert "unpacks to more than 64 times its size" in said
+    assert "unpacks to more than 1 times its size" in said
     assert {each.name for each in tmp_path.iterdir()} == {"bomb.pcap.gz"}
 
 
@@ -424,3 +427,78 @@ def test_nothing_given_and_files_of_another_kind_are_named(
         got, said = run(capsys, *words, "-o", log)
         assert (got, said.count("\n")) == (code, 1), said
         assert what in said
+
+
+# What unpacks without end ---------------------------------------------------------------------------------------------
+
+
+def ros1_packed(path: Path, packets: Frames, form: Any) -> Path:
+    store = store_of(Stores.ROS1_NOETIC)
+    writer = rosbag1.Writer(path)
+    writer.set_compression(form)
+    with writer:
+        connection = writer.add_connection("/velodyne_packets", "velodyne_msgs/msg/VelodyneScan", typestore=store)
+        for time_ns, scan in scans(store, packets):
+            writer.write(connection, time_ns, store.serialize_ros1(scan, connection.msgtype))
+    return path
+
+
+def ros2_packed(path: Path, packets: Frames, storage: rosbag2.StoragePlugin, mode: Any) -> Path:
+    store = store_of(Stores.ROS2_HUMBLE)
+    writer = rosbag2.Writer(path, version=9, storage_plugin=storage)
+    writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/velodyne_packets", "velodyne_msgs/msg/VelodyneScan", typestore=store)
+        for time_ns, scan in scans(store, packets):
+            writer.write(connection, time_ns, store.serialize_cdr(scan, connection.msgtype))
+    return path
+
+
+PACKED: dict[str, Callable[[Path, Frames], Path]] = {
+    "ROS 1, bz2": lambda folder, packets: ros1_packed(folder / "a.bag", packets, rosbag1.Writer.CompressionFormat.BZ2),
+    "ROS 1, lz4": lambda folder, packets: ros1_packed(folder / "a.bag", packets, rosbag1.Writer.CompressionFormat.LZ4),
+    "ROS 2, chunks": lambda folder, packets: (
+        ros2_packed(folder / "a", packets, rosbag2.StoragePlugin.MCAP, rosbag2.CompressionMode.STORAGE) / "a.mcap"
+    ),
+    "ROS 2, messages": lambda folder, packets: ros2_packed(
+        folder / "a", packets, rosbag2.StoragePlugin.SQLITE3, rosbag2.CompressionMode.MESSAGE
+    ),
+    "ROS 2, file": lambda folder, packets: ros2_packed(
+        folder / "a", packets, rosbag2.StoragePlugin.SQLITE3, rosbag2.CompressionMode.FILE
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", list(PACKED))
+def test_a_bag_that_unpacks_beyond_any_recording_is_one_sentence(
+    kind: str, packets: Frames, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = PACKED[kind](tmp_path, packets)
+    assert run(capsys, "--bag", path, "-o", tmp_path / "log.mcap") == (0, "")
+    monkeypatch.setattr(packed, "_MOST_BYTES", 1 << 12)
+    monkeypatch.setattr(packed, "EXPANSION", 1)
+    code, said = run(capsys, "--bag", path, "-o", tmp_path / "other.mcap")
+    assert (code, said.count("\n")) == (1, 1)
+    assert "unpacks to more than 1 times its size" in said
+    assert not (tmp_path / "other.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        """CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)
+        SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(1000000) AS data FROM n""",
+        "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data AS (zeroblob(1000000000)))",
+    ],
+)
+def test_tables_of_a_bag_that_are_computed_are_refused(
+    hostile: str, packets: Frames, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = BAGS["db3"](tmp_path, {"/velodyne_packets": packets})
+    with contextlib.closing(sqlite3.connect(path)) as bag:
+        bag.execute("DROP TABLE messages")
+        bag.execute(hostile)
+        bag.commit()
+    code, said = run(capsys, "--bag", path, "-o", tmp_path / "log.mcap")
+    assert code == 1
+    assert "messages are computed" in said
