@@ -63,7 +63,7 @@ COMMANDS: dict[str, tuple[list[str], int]] = {
     "process, the cloud": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 1500),
     "process, the first step": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 16),
     "adjust": (["adjust", "IN/out/cloud.laz", "-t", "IN/out/trajectory.csv", "-o", "DISK/new/out"], 256),
-    "import": (["import", "--pcap", "IN/a.pcap", "-o", "DISK/new/a.mcap"], 64),
+    "import": (["import", "--pcap", "IN/a.pcap", "-o", "DISK/new/a.mcap"], 0),
     "import, packed": (["import", "--pcap", "IN/a.pcap", "--mavlink", "IN/a.tlog.gz", "-o", "DISK/new/a.mcap"], 16),
     "calibrate": (["calibrate", "IN/a.mcap", "-o", "DISK/new/out"], 0),
     "init": (["init", "IN/a.mcap", "-o", "DISK/new/survey.yaml"], 0),

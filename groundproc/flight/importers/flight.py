@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 from flightlog import __version__
 from flightlog.errors import LogError, UsageError
 from flightlog.logfile import LogWriter
+from groundproc.files import made_folder
 from groundproc.flight.importers import outcome
 from groundproc.flight.importers.batching import Joiner
 from groundproc.flight.importers.joining import Event, LogMessage
@@ -115,18 +116,21 @@ def import_flight(
     senders = Senders(address_of(sender) if sender else b"")
     partial = output.with_name(f".{output.name}.partial")
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".swath-import-", dir=output.parent) as unpacked:
-            while True:
-                result = _attempt(recordings, partial, Path(unpacked), ports, attachments, senders, progress)
-                if result is not None:
-                    break
-        partial.replace(output)
+        with (
+            made_folder(output.parent),
+            tempfile.TemporaryDirectory(prefix=".swath-import-", dir=output.parent) as unpacked,
+        ):
+            try:
+                while True:
+                    result = _attempt(recordings, partial, Path(unpacked), ports, attachments, senders, progress)
+                    if result is not None:
+                        break
+                partial.replace(output)
+            finally:
+                with suppress(OSError):
+                    partial.unlink(missing_ok=True)
     except OSError as error:
         raise LogError(f"{output}: cannot be written ({error.strerror})") from None
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
     return result
 
 
