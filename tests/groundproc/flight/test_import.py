@@ -349,8 +349,8 @@ def test_wrong_places_are_one_sentence_each(small: Path, tmp_path: Path, capsys:
         (["--pcap", small, small, "-o", log], 2, "given twice"),
         (["--pcap", small, "-o", small, "--force"], 2, "is an input"),
         (["--pcap", small, "-o", folder, "--force"], 2, "is a folder"),
-        (["--pcap", small, "-o", file / "l.mcap"], 1, "cannot be written"),
-        (["--pcap", small, "-o", "/proc/l.mcap"], 1, "cannot be written"),
+        (["--pcap", small, "-o", file / "l.mcap"], 1, "is no folder that can be written to"),
+        (["--pcap", small, "-o", "/proc/l.mcap"], 1, "is no folder that can be written to"),
         (["--pcap", small, "-o", file], 2, "expected a name that ends in .mcap"),
     ):
         got, said = run(capsys, *words)
