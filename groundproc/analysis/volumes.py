@@ -20,6 +20,7 @@ Array = npt.NDArray[np.float64]
 
 BASES: Final = ("toe", "plane")
 _IDS: Final = ("id", "name", "ID", "Name")
+_LONGEST_EDGE_M: Final = 50_000.0
 _EDGE_KNOWN: Final = 0.5
 """Share of the edge whose height has to be known."""
 
@@ -60,6 +61,10 @@ def measure(
     for name, each in zip(ids, shapes, strict=True):
         if each.geom_type != "Polygon" or not each.is_valid:
             raise UsageError(f"{polygons_path}: {name}: expected one polygon whose edge does not cross itself")
+        if each.exterior.length > _LONGEST_EDGE_M:
+            raise UsageError(
+                f"{polygons_path}: {name}: an edge of {each.exterior.length:,.0f} m found, expected {_LONGEST_EDGE_M:,.0f} m at most"
+            )
     points = _around(cloud, shapes, progress)
     found = [_one(name, each, some, base) for name, each, some in zip(ids, shapes, points, strict=True)]
     if not any(each.volume for each in found):

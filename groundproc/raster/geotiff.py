@@ -153,9 +153,11 @@ class Raster:
             The file is damaged.
         """
         try:
-            read = self.file.read(
-                1, window=_window(self.grid, window), boundless=True, masked=True, out_dtype="float32"
-            )
+            # what stands for none may be a number that single precision does not have
+            with np.errstate(invalid="ignore", over="ignore"):
+                read = self.file.read(
+                    1, window=_window(self.grid, window), boundless=True, masked=True, out_dtype="float32"
+                )
         except _TROUBLE as error:
             raise CaptureError(f"{self.path}: is damaged ({_sentence(error)})") from None
         found = np.asarray(read.filled(np.nan), np.float32)
@@ -165,6 +167,7 @@ class Raster:
                 f"{self.path}: values such as {largest:g} found, expected heights within {_FARTHEST_M:g} m; does it not state which "
                 "value stands for none?"
             )
+        found[np.isnan(found)] = np.nan  # without the bits that make arithmetic complain
         return found
 
 
@@ -206,6 +209,8 @@ def opened(path: Path) -> Iterator[Raster]:
         raise CaptureError(f"{path}: cannot be read as a raster ({_sentence(error)})") from None
     with file:
         transform = file.transform
+        if not np.isfinite(transform).all():
+            raise CaptureError(f"{path}: its corner or cells are no numbers")
         if transform.is_identity or transform.b or transform.d or not np.isclose(transform.a, -transform.e, rtol=1e-6):
             raise CaptureError(f"{path}: cells of {transform.a:g} x {-transform.e:g} found, expected squares, north up")
         cell_m = float(transform.a)

@@ -20,6 +20,9 @@ DRIVERS: Final = {".gpkg": "GPKG", ".geojson": "GeoJSON", ".json": "GeoJSON"}
 _DAMAGE: Final = (DataSourceError, DataLayerError, shapely.errors.ShapelyError, ValueError, RuntimeError)
 
 
+_FARTHEST_M: Final = 1e8
+
+
 @dataclass(frozen=True, slots=True)
 class Features:
     """Geometries and what is known of each.
@@ -84,6 +87,9 @@ def read_features(path: Path, kind: str) -> Features:
         if each is None or each.is_empty or each.geom_type not in (kind, f"Multi{kind}"):
             found = "nothing" if each is None or each.is_empty else each.geom_type
             raise CaptureError(f"{path}: feature {number} is {found}, expected {kind}")
+    farthest = float(np.abs(shapely.get_coordinates(geometry)).max())
+    if not farthest <= _FARTHEST_M:
+        raise CaptureError(f"{path}: a coordinate of {farthest:g} found, expected {_FARTHEST_M:g} at most")
     try:
         crs = pyproj.CRS.from_user_input(meta["crs"]) if meta["crs"] else None
     except CRSError as error:

@@ -2,6 +2,8 @@
 
 import json
 import os
+import random
+import re
 import resource
 import shutil
 import subprocess
@@ -9,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import farther
 import fuzzing
 import pytest
 import seeds
@@ -51,7 +54,7 @@ def test_good_files_go_through_every_door(tmp_path: Path, capsys: pytest.Capture
         "a.mcap": seeds.log(), "b.pcap": seeds.pcapng(), "b.tlog": seeds.tlog(), "b.yaml": seeds.MOUNT, "b.npz": seeds.scans_npz(),
         "b.csv": seeds.imu(), "b.pos": seeds.nmea(),
     }  # fmt: skip
-    for door in fuzzing.doors():
+    for door in fuzzing.own_doors():
         if door.words[0] == "adjust":  # minutes; its files are read in tests/groundproc/strips
             continue
         place = tmp_path / "case"
@@ -63,6 +66,35 @@ def test_good_files_go_through_every_door(tmp_path: Path, capsys: pytest.Capture
         assert fuzzing.ask(door, file, good) == ("", 1 if judged else 0), door
         assert not judged or reasons(file, capsys) == {"together", "lost_packets"}
         shutil.rmtree(place)
+
+
+ENDS = {
+    "process log": "0.9 s of both together|0.8 s of both together", "process positions": "read|states no sigma", "process": "read",
+    "process trajectory": "shots lie outside it", "compass": "has to move past something", "assess pairs": "", "assess": "4 or more",
+    "volume polygons": "of its edge is not known", "pull manifest": "the next pull goes on from here",
+}  # fmt: skip
+"""What good files that lie beside a flight end in, where that is no product."""
+
+
+def test_good_files_beside_a_flight_are_read_to_their_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(seeds, "mutated", lambda data, dice: data)
+    good = tmp_path / "good"
+    fuzzing.good_files(good)
+    for door in farther.doors():
+        ends = ENDS.get(door.name, ENDS.get(door.name.split()[0], ""))
+        for made in door.made:
+            place = tmp_path / "case"
+            place.mkdir()
+            file = seeds.write(place, door.file, made(random.Random(1)))
+            said = fuzzing.Said()
+            with farther.readers_only():
+                what, code = fuzzing.ask(door, file, good, said)
+            assert what == "", door
+            assert code == int(bool(ends)) or "states no sigma" in said.text, (door, said.text)
+            assert re.search(ends, said.text), (door, said.text)
+            shutil.rmtree(place)
 
 
 def test_spoilt_files_of_every_kind_end_in_a_sentence(tmp_path: Path) -> None:

@@ -37,6 +37,11 @@ class TooLongError(Exception):
 
 def doors() -> list[Door]:
     """All of them, on small files."""
+    return [*own_doors(), *farther.doors()]
+
+
+def own_doors() -> list[Door]:
+    """Those of flights, recordings and clouds."""
     plain, packed = seeds.log(compression="none"), seeds.log()
     logs: tuple[Made, ...] = (
         spoilt(plain),
@@ -89,7 +94,6 @@ def doors() -> list[Door]:
         ),
         Door("control", "c.csv", (*strips, "--control", "{file}"), (spoilt(seeds.control()),)),
         Door("options", "o.yaml", (*strips, "--config", "{file}"), (spoilt(seeds.OPTIONS),)),
-        *farther.doors(),
     ]  # fmt: skip
 
 
@@ -142,7 +146,14 @@ def _all_read(site: work.Site, progress: work.Progress) -> None:
     raise SwathError("read")
 
 
-def ask(door: Door, file: Path, good: Path) -> tuple[str, int]:
+@dataclass
+class Said:
+    """What a command printed."""
+
+    text: str = ""
+
+
+def ask(door: Door, file: Path, good: Path, heard: Said | None = None) -> tuple[str, int]:
     """Run a command; what was wrong with it, or nothing, and its exit code."""
     out = file.parent / "out"
     words = [word.format(file=file, out=out, good=good) for word in door.words]
@@ -166,6 +177,8 @@ def ask(door: Door, file: Path, good: Path) -> tuple[str, int]:
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__} in {Path(where.filename).name}: {where.name}: {str(error)[:80]!r}", code
+    if heard is not None:
+        heard.text = said.getvalue()
     return _judged(said.getvalue(), code, () if door.keeps else _left(file)), code
 
 

@@ -182,10 +182,16 @@ def _placed(origin: Origin | None, path: Path) -> Origin:
     return origin
 
 
+_LATEST_S: Final = 9_000_000_000
+"""In 2255; beyond 2262 nanoseconds do not go into 64 bits."""
+
+
 def _time_ns(text: str) -> int | None:
     """Nanoseconds of decimal seconds, exactly; None where it is no time."""
     found = _TIME.fullmatch(text)
-    return None if found is None else int(found[1]) * NS_PER_S + int((found[2] or "")[:9].ljust(9, "0"))
+    if found is None or int(found[1]) >= _LATEST_S:
+        return None
+    return int(found[1]) * NS_PER_S + int((found[2] or "")[:9].ljust(9, "0"))
 
 
 def _numbers(words: Sequence[str]) -> list[float] | None:
