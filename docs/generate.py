@@ -10,6 +10,7 @@ import dataclasses
 import importlib
 import json
 import re
+import textwrap
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -275,10 +276,56 @@ def health_schema() -> str:
     return json.dumps(healthschema.schema(), indent=1) + "\n"
 
 
-PAGES: Final[dict[str, Callable[[], str]]] = {
+_MARK: Final = re.compile(r" *(?:- |\d+\. )?")
+_NO_PROSE: Final = ("|", "#", "```", "<", "    ")
+
+
+def wrapped(text: str) -> str:
+    """A page whose paragraphs and lists have lines of up to 118 characters; tables, headings and code stay."""
+    out: list[str] = []
+    paragraph: list[str] = []
+    code = False
+
+    def flush() -> None:
+        if not paragraph:
+            return
+        found = _MARK.match(paragraph[0])
+        mark = found[0] if found else ""
+        joined = " ".join(line.strip() for line in paragraph).removeprefix(mark.strip()).strip()
+        out.extend(
+            textwrap.wrap(
+                joined,
+                118,
+                initial_indent=mark,
+                subsequent_indent=" " * len(mark),
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+            if max(map(len, paragraph)) > 118
+            else paragraph
+        )
+        paragraph.clear()
+
+    for line in text.split("\n"):
+        code ^= line.startswith("```")
+        prose = line.strip() and not code and not line.startswith(_NO_PROSE)
+        if not prose or (found := _MARK.match(line)) is None or found[0].strip():
+            flush()
+        if prose:
+            paragraph.append(line)
+        else:
+            out.append(line)
+    flush()
+    return "\n".join(out)
+
+
+_MADE: Final[dict[str, Callable[[], str]]] = {
     "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
     "methods/observations.md": observations_page, "health.schema.json": health_schema,
 }  # fmt: skip
+PAGES: Final[dict[str, Callable[[], str]]] = {
+    name: (lambda made=made: wrapped(made())) if name.endswith(".md") else made for name, made in _MADE.items()
+}
 
 
 if __name__ == "__main__":

@@ -17,7 +17,9 @@ HELP = "find boresight, lever arm, clock offset, compass curve and corrections o
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.options import add_settings
     from groundproc.commands.outputs import add_force
+    from groundproc.survey import MountSettings
 
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="flight logs, each a flight of its own")
     parser.add_argument(
@@ -28,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for mount.yaml, compass.yaml and calibration.json",
     )
-    parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml to begin from, in place of the logs'")
+    add_settings(parser, [MountSettings], only=("mount",))
     parser.add_argument(
         "--lasers",
         action="store_true",
@@ -68,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     claim_folder(arguments.output, names, arguments.force)
     with LogReader(logs[0]) as reader:
-        nominal, _ = find_mount(str(arguments.mount) if arguments.mount else None, [reader])
+        nominal, _ = find_mount(arguments.mount, [reader])
         lasers = lidar_of([reader]).lasers
     flights: list[FlightResult] = []
     with stages(logs, {"read": "clocks and autopilots", "adjust": "flights"}) as progress:

@@ -26,7 +26,9 @@ DEFAULT_PORT = 8080
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
+    from groundproc.commands.options import add_settings
     from groundproc.commands.outputs import add_force
+    from groundproc.survey import MountSettings, PlacingSettings
 
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of what stays")
     add_force(parser)
@@ -39,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--position-port", type=_port, metavar="PORT", help="default: 8308")
     parser.add_argument("--follow", type=Path, metavar="LOG", help="a flight log that grows, in place of the network")
     parser.add_argument("--link", choices=("ins", "fc"), help="which autopilot's, with --follow; default: ins")
-    parser.add_argument("--mount", type=Path, metavar="FILE", help="mount.yaml; default: the log's, else the project's")
+    add_settings(parser, [MountSettings], only=("mount",))
     parser.add_argument("--height", choices=("msl", "relative"), default="msl", help="of the positions; default: msl")
-    parser.add_argument("--fov", metavar="A-B", help="azimuths used, clockwise, in degrees, or all; default: 255-105")
+    add_settings(parser, [PlacingSettings], only=("fov_deg",))
     parser.add_argument("--voxel", type=_metres, default=0.15, metavar="M", help="of the thinned cloud; default: 0.15")
     parser.add_argument("--points", type=int, default=2_000_000, metavar="N",
                         help="at most so many points, then the voxels grow; default: 2000000")  # fmt: skip
@@ -149,24 +151,26 @@ def _say_once() -> Callable[[bool], None]:
 
 
 def _options(arguments: argparse.Namespace) -> Any:
-    from groundproc.commands.values import field_of_view
+    from groundproc.commands.options import chosen_settings
     from groundproc.live.estimator import Options
     from groundproc.sensors.shots import Gate
+    from groundproc.survey import PlacingSettings
 
-    fov = field_of_view(arguments.fov) if arguments.fov else (255.0, 105.0)
+    chosen = chosen_settings(arguments, PlacingSettings)
     patience_ns = 400_000_000 if arguments.follow is None else 2_000_000_000
-    return Options(_mount(arguments), arguments.height, Gate(*fov, 1.0, 100.0), patience_ns)
+    return Options(
+        _mount(arguments), arguments.height, Gate(*chosen.fov_deg, chosen.min_range_m, chosen.max_range_m), patience_ns
+    )
 
 
 def _mount(arguments: argparse.Namespace) -> Mount:
     from flightlog.logfile import LogReader
     from groundproc.flight.mounting import find_mount
 
-    chosen = None if arguments.mount is None else str(arguments.mount)
     if arguments.follow is None:
-        return find_mount(chosen, [])[0]
+        return find_mount(arguments.mount, [])[0]
     with LogReader(arguments.follow) as reader:
-        return find_mount(chosen, [reader])[0]
+        return find_mount(arguments.mount, [reader])[0]
 
 
 def _source(arguments: argparse.Namespace, inbox: Inbox) -> Source:

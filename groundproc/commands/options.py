@@ -4,12 +4,13 @@ import argparse
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from flightlog import config
 from groundproc.commands.values import field_of_view, milliseconds
 from groundproc.survey.setting import Command, command_of, default_of, value_text
 
+T = TypeVar("T")
 READERS: Final[dict[str, Callable[[str, str], Any]]] = {"azimuths": field_of_view, "milliseconds": milliseconds}
 
 
@@ -73,6 +74,18 @@ def given_settings(arguments: argparse.Namespace, sections: Sequence[type[Any]])
             if value is not None:
                 found[field.name] = _read(value, field)
     return found
+
+
+def chosen_settings(arguments: argparse.Namespace, section: type[T], defaults: Mapping[str, Any] | None = None) -> T:
+    """A section of the survey as the command line has it; what is not given is the command's own default, else the survey's.
+
+    Raises
+    ------
+    UsageError, ConfigError
+        A value that cannot be read, or cannot be.
+    """
+    tree = config.to_mapping(section()) | dict(defaults or {}) | given_settings(arguments, [section])
+    return config.from_mapping(tree, section, "command line")
 
 
 def _read(value: Any, field: "dataclasses.Field[Any]") -> Any:
