@@ -27,8 +27,15 @@ class LidarConfig:
     """The HDL-32E's two UDP ports."""
 
     address: str = option("0.0.0.0", "local address to listen on; 0.0.0.0 also takes broadcasts")
-    data_port: int = option(HDL32E_DATA_PORT, "port of the data packets", minimum=1, maximum=65535)
-    position_port: int = option(HDL32E_POSITION_PORT, "port of the position packets", minimum=1, maximum=65535)
+    data_port: int = option(
+        HDL32E_DATA_PORT,
+        "port of the data packets; what --lidar-port is in swath import, live and replay",
+        minimum=1,
+        maximum=65535,
+    )
+    position_port: int = option(
+        HDL32E_POSITION_PORT, "port of the position packets; --position-port there", minimum=1, maximum=65535
+    )
     receive_buffer_kb: int = option(
         9216, "kernel receive buffer; 9216 bridges a stall of 4 s [kB]", minimum=16, maximum=262144
     )

@@ -51,12 +51,12 @@ CAPTURE: Final = Kind("capture", "a packet capture", "`swath import --pcap {} -o
 TLOG: Final = Kind(
     "tlog",
     "a telemetry log of a ground station",
-    "`swath import --pcap CAPTURE --mavlink {} -o LOG.mcap` makes a flight log of it and the lidar's capture",
+    "`swath import --mavlink {} -o LOG.mcap` makes a flight log of it, with --pcap CAPTURE of it and the lidar's packets",
 )
 DATAFLASH: Final = Kind(
     "dataflash",
     "a dataflash log of an autopilot",
-    "`swath import --pcap CAPTURE --mavlink {} -o LOG.mcap` makes a flight log of it and the lidar's capture",
+    "`swath import --mavlink {} -o LOG.mcap` makes a flight log of it, with --pcap CAPTURE of it and the lidar's packets",
 )
 MAVLINK: Final = Kind(
     "mavlink", "a MAVLink stream without times", "nothing ties it to a lidar; a .tlog or a .bin is needed"
