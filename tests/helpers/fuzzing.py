@@ -115,6 +115,8 @@ class Findings:
     cases: int = 0
     codes: Counter[int] = field(default_factory=Counter)
     wrong: dict[str, Path] = field(default_factory=dict)
+    grown_bytes: Counter[str] = field(default_factory=Counter)
+    """The most memory that a command asked for beyond what was there before it, by door."""
 
 
 def run(folder: Path, seed: int, go_on: Callable[[int], bool], chosen: list[Door] | None = None) -> Findings:
@@ -129,7 +131,9 @@ def run(folder: Path, seed: int, go_on: Callable[[int], bool], chosen: list[Door
             place = folder / "case"
             place.mkdir()
             file = seeds.write(place, door.file, dice.choice(door.made)(dice))
+            before = begin_peak_bytes()
             what, code = ask(door, file, folder / "good")
+            found.grown_bytes[door.name] = max(found.grown_bytes[door.name], memory_bytes("VmHWM") - before)
             found.cases += 1
             found.codes[code] += 1
             if what and f"{door.name}: {what}" not in found.wrong:
@@ -137,6 +141,20 @@ def run(folder: Path, seed: int, go_on: Callable[[int], bool], chosen: list[Door
                 found.wrong[f"{door.name}: {what}"] = Path(shutil.copy(file, kept))
             shutil.rmtree(place)
     return found
+
+
+def memory_bytes(name: str) -> int:
+    """VmHWM or VmRSS of this process."""
+    found = re.search(rf"{name}:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) << 10
+
+
+def begin_peak_bytes() -> int:
+    """Forget the peak so far; what is in use now."""
+    with contextlib.suppress(OSError):  # not every sandbox lets it be
+        Path("/proc/self/clear_refs").write_text("5")
+    return memory_bytes("VmRSS")
 
 
 def _all_read(site: work.Site, progress: work.Progress) -> None:
