@@ -17,6 +17,8 @@ from pyproj.exceptions import CRSError
 from flightlog.errors import CaptureError, GeodesyError, SourceError, UsageError
 
 DRIVERS: Final = {".gpkg": "GPKG", ".geojson": "GeoJSON", ".json": "GeoJSON"}
+_SAME: Final = 90
+"""Confidence of pyproj in a code: the same CRS, by whatever name."""
 _DAMAGE: Final = (DataSourceError, DataLayerError, shapely.errors.ShapelyError, ValueError, RuntimeError)
 
 
@@ -52,9 +54,15 @@ class Features:
         if self.crs is None or self.crs.equals(crs, ignore_axis_order=True):
             return self
         transformer = pyproj.Transformer.from_crs(self.crs, crs, always_xy=True)
-        moved = shapely.transform(
-            self.geometry, lambda xy: np.stack(transformer.transform(xy[:, 0], xy[:, 1]), axis=1), include_z=False
-        )
+
+        def across(places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+            return np.column_stack([*transformer.transform(places[:, 0], places[:, 1]), places[:, 2:]])
+
+        solid = shapely.has_z(self.geometry)
+        moved = np.array(self.geometry, object)
+        for some in (solid, ~solid):  # shapely would drop the heights of the one or make some up for the other
+            if some.any():
+                moved[some] = shapely.transform(moved[some], across, include_z=bool(some is solid))
         if not np.isfinite(shapely.get_coordinates(moved)).all():
             raise GeodesyError(f"features in {self.crs.name} have no place in {crs.name}")
         return Features(moved, self.columns, crs)
@@ -107,6 +115,7 @@ def write_features(path: Path, features: Features, kind: str, layer: str, ending
     kind : str
         Geometry type, such as "LineString Z".
     layer : str
+        GeoJSON names a CRS by its EPSG code; features in a CRS that has none are written in WGS 84 there.
     ending : str, optional
         What decides on the format where the name of `path` does not.
 
@@ -120,6 +129,8 @@ def write_features(path: Path, features: Features, kind: str, layer: str, ending
     suffix = (ending or path.suffix).lower()
     if suffix not in DRIVERS:
         raise UsageError(f"{path}: expected a name that ends in {' or '.join(DRIVERS)}")
+    if DRIVERS[suffix] == "GeoJSON":
+        features = _nameable(features)
     names = list(features.columns)
     named = path.with_name(f"{path.name}{suffix}")  # GDAL looks at the ending too
     try:
@@ -136,6 +147,16 @@ def write_features(path: Path, features: Features, kind: str, layer: str, ending
         raise SourceError(f"{path}: cannot be written ({' '.join(str(error).split())})") from None
     finally:
         named.unlink(missing_ok=True)
+
+
+def _nameable(features: Features) -> Features:
+    """Features whose CRS GeoJSON can name, by an EPSG code; else in WGS 84, which is what a file without a name is taken for."""
+    if features.crs is None or not len(features):
+        return features
+    code = features.crs.to_epsg(_SAME)
+    if code is None:
+        return features.into(pyproj.CRS.from_epsg(4326))
+    return Features(features.geometry, features.columns, pyproj.CRS.from_epsg(code))
 
 
 def _storable(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
