@@ -9,6 +9,7 @@ reflectance_error         largest error of the mean of a panel or a cell of 1 m 
 strip_bias_percent        largest difference of a strip of lasR's bcts from the others, single echoes in cells of 2 m
 change_detection_rate     share of boxes of 1 dm3 found, 1000 points/m2 amid swaying shrubs
 change_false_per_100m2    claims that are none, there
+(those of uses_clouds.py)  ground, detection, wires, trees, buildings
 sight_exact_agreement     share of cells of 200 random surfaces where `exact` says what a dense walk along the line says
 sight_fast_agreement      share of cells of a terrain of a million cells where `fast` says what `exact` says
 sight_fast_ratio_to_gdal  CPU time of `fast` over that of GDAL, for it
@@ -29,6 +30,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import uses_clouds
 from scipy.ndimage import gaussian_filter
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -250,6 +252,7 @@ FIGURES: Final[dict[str, Callable[[], Figures]]] = {
     "strips": strips,
     "change": change,
     "sight": sight,
+    **uses_clouds.FIGURES,
 }
 
 if __name__ == "__main__":
