@@ -79,7 +79,7 @@ def solve(
     """
     unknowns = lay_out(block)
     now, damping = cost(block, known, unknowns), _FIRST_DAMPING
-    settled, number = False, 0
+    settled, undamped, number = False, False, 0
     for number in range(1, most_steps + 1):
         trial, after, damping = _descend(block, known, unknowns, now, damping)
         if trial is None:
@@ -89,11 +89,11 @@ def solve(
         if progress is not None:
             progress(number, now)
         if gained <= SETTLED * max(now, 1e-12):
-            if damping == 0.0:
+            if undamped:
                 settled = True
                 break
             # what little damping there is holds the soft modes of a block: the bend of a strip costs next to nothing
-            damping = 0.0
+            damping, undamped = 0.0, True
         else:
             damping = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
     return Solved(block, unknowns, known, now, number, settled)
