@@ -62,8 +62,11 @@ def test_a_compass_that_is_off_is_no_lost_way(tmp_path: Path, street: Any, capsy
     out, processed = tmp_path / "live", tmp_path / "processed"
     assert main(["live", "--follow", str(street.log), "--port", "0", "--json", "-o", str(out)]) == 0
     status = json.loads([line for line in capsys.readouterr().out.splitlines() if line.startswith("{")][-1])
-    assert main(["process", str(street.log), "--method", "adjusted", "--causal", "-o", str(processed), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["adjusted"]["restarts"] == 0
+    # doubtful, for half of the packets are missing, and for nothing else
+    assert main(["process", str(street.log), "--method", "adjusted", "--causal", "-o", str(processed), "--json"]) == 3
+    told = json.loads(capsys.readouterr().out)
+    assert [reason["about"] for reason in told["verdict_reasons"]] == ["lost_packets"]
+    assert told["adjusted"]["restarts"] == 0
     table = np.asarray(np.genfromtxt(out / "trajectory_live.csv", delimiter=",", names=True, dtype=None))
     time_ns = table["utc_ns"].astype(np.int64)
     live = Compared(

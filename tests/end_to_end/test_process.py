@@ -224,7 +224,8 @@ def test_the_cloud_is_las_1_4_with_all_that_was_measured(gps_flight: Any, flown:
     crs = cloud.header.parse_crs()
     assert crs is not None
     assert [part.to_epsg() for part in crs.sub_crs_list] == [32633, 5773]
-    assert set(cloud.point_format.extra_dimension_names) == {"laser", "range"}
+    extra = {"laser", "range", "incidence", "mixed", "sigma_h", "sigma_v"}
+    assert set(cloud.point_format.extra_dimension_names) == extra
     assert np.asarray(cloud["laser"]).max() == 31
     assert 1.0 <= np.asarray(cloud["range"]).min() <= np.asarray(cloud["range"]).max() <= 100.0
     assert set(np.asarray(cloud.return_number).tolist()) == set(np.asarray(cloud.number_of_returns).tolist()) == {1}
