@@ -77,10 +77,10 @@ def read_poses(path: Path) -> ImagePoses:
             for number, words in table.rows():
                 given = dict(zip(table.names, words, strict=True))
                 try:
-                    stamps.append(int(given["utc_ns"]) if given.get("utc_ns") else NO_TIME)
+                    stamps.append(int(np.int64(int(given["utc_ns"]))) if given.get("utc_ns") else NO_TIME)
                     values = [float(given[name]) for name in needed[1:]]
                     values += [float(given.get(name) or "nan") for name in SIGMAS]
-                except ValueError:
+                except (ValueError, OverflowError):
                     values = [np.nan]
                 if not np.isfinite(values[:6]).all():
                     raise CaptureError(f"{path}: line {number}: {table.blame(words, 'numbers in every column')}")

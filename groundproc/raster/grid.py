@@ -8,6 +8,8 @@ from typing import Final, Self
 from flightlog.errors import UsageError
 
 SMALLEST_CELL_M: Final = 1e-3
+LONGEST_SIDE: Final = 1 << 19
+"""Cells: 131 km of 0.25 m, farther than any flight."""
 LARGEST_RASTER: Final = 1 << 34
 """Cells of one raster: some 17 thousand million are 68 GB as they are stored."""
 
@@ -45,9 +47,10 @@ class Grid(Window):
     cell_m: float
 
     def __post_init__(self) -> None:
-        if self.columns * self.rows > LARGEST_RASTER:
+        if self.columns * self.rows > LARGEST_RASTER or max(self.columns, self.rows) > LONGEST_SIDE:
             raise UsageError(
-                f"a raster of {self.columns} x {self.rows} cells of {self.cell_m:g} m found, expected at most {LARGEST_RASTER:,}; "
+                f"a raster of {self.columns} x {self.rows} cells of {self.cell_m:g} m found, expected at most {LARGEST_RASTER:,}, "
+                f"and {LONGEST_SIDE:,} a side; "
                 "choose larger cells, or take out the points that lie far from the others"
             )
 

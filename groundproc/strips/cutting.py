@@ -21,6 +21,8 @@ BIN_NS: Final = 100_000_000
 WINDOW_S: Final = 6.0
 """A turn is what changes the course within this time."""
 _WIDE_RAD: Final = np.deg2rad(100.0)
+_PAUSE_NS: Final = 60_000_000_000
+"""Between two poses: who has not flown for so long begins another line."""
 _SLOWEST_M_S: Final = 0.3
 _MIXED: Final = 5
 """More changes than this for each id say that ids do not follow each other in time: tiles, or two scanners at once."""
@@ -121,10 +123,20 @@ class Occupancy:
 
 
 def line_begins_ns(trajectory: Trajectory, turn_deg: float) -> Ints:
-    """Times [ns], shape (k,), at which another flight line begins: the middle of each turn, as strips are cut; the first line has none."""
-    start_ns = int(trajectory.time_ns[0])
-    bins = int((trajectory.time_ns[-1] - start_ns) // BIN_NS) + 1
-    return np.asarray(start_ns + BIN_NS * turns(trajectory, start_ns, bins, turn_deg))
+    """Times [ns], shape (k,), at which another flight line begins; the first line has none.
+
+    The middle of each turn, as strips are cut, and the end of a pause: so work follows the poses, and not the time between two of them.
+    """
+    begins: list[Ints] = []
+    edges = [0, *(np.flatnonzero(np.diff(trajectory.time_ns) > _PAUSE_NS) + 1), len(trajectory)]
+    for first, last in itertools.pairwise(edges):
+        part = trajectory.part(slice(int(first), int(last)))
+        start_ns = int(part.time_ns[0])
+        bins = int((part.time_ns[-1] - start_ns) // BIN_NS) + 1
+        if first:
+            begins.append(np.array([start_ns], np.int64))
+        begins.append(start_ns + BIN_NS * turns(part, start_ns, bins, turn_deg))
+    return np.concatenate(begins)
 
 
 def turns(poses: Trajectory, start_ns: int, bins: int, turn_deg: float) -> Ints:

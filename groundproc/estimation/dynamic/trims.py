@@ -125,7 +125,7 @@ def read_yaw(path: Path) -> tuple[Times, Array, Array]:
         angles = np.array([[float(row[place]) for place in places[1:]] for row in rows]).reshape(-1, 2)
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         raise LogError(
             f"{path}: is no table of trims; expected the columns {', '.join(COLUMNS[:3])} and numbers"
         ) from None
