@@ -26,8 +26,8 @@ from groundproc.imagery.session import Task
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
-import dbat  # noqa: E402
-import imageblock  # noqa: E402
+import dbat  # noqa: E402 (found by the path above)
+import imageblock  # noqa: E402 (found by the path above)
 
 Array = npt.NDArray[np.float64]
 

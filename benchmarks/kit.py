@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
-from guest import Guest  # noqa: E402
+from guest import Guest  # noqa: E402 (found by the path above)
 
 
 def main() -> int:

@@ -21,13 +21,13 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
-from browser import PROGRAM, browser  # noqa: E402
-from machine import busy_s  # noqa: E402
+from browser import PROGRAM, browser  # noqa: E402 (found by the path above)
+from machine import busy_s  # noqa: E402 (found by the path above)
 
-from groundproc.cloud import exports, reader  # noqa: E402
-from groundproc.cloud.points import Points  # noqa: E402
-from groundproc.cloud.writer import CloudWriter  # noqa: E402
-from groundproc.geodesy import projected_crs  # noqa: E402
+from groundproc.cloud import exports, reader  # noqa: E402 (found by the path above)
+from groundproc.cloud.points import Points  # noqa: E402 (found by the path above)
+from groundproc.cloud.writer import CloudWriter  # noqa: E402 (found by the path above)
+from groundproc.geodesy import projected_crs  # noqa: E402 (found by the path above)
 
 POINTS = 4_000_000
 LOADS = 5

@@ -104,6 +104,6 @@ def _told(place: str, what: str) -> Iterator[None]:
         raise UsageError(f"{place}: {error}") from None
     except FileNotFoundError as error:
         raise SourceError(f"{place}: is not there") from error
-    except Exception as error:  # each file system has errors of its own
+    except Exception as error:  # broad: each file system has errors of its own, and all become one sentence here
         words = " ".join(str(error).split()) or type(error).__name__
         raise SourceError(f"{place}: cannot be {what} ({words})") from error
