@@ -24,6 +24,10 @@ EDGE_STEP_M: Final = 0.5
 """Between the places along the edge whose heights are taken."""
 MARGIN_M: Final = RADII_M[-1]
 """Points so far outside a polygon are used for the heights of its edge."""
+AROUND_M: Final = 5.0
+"""Ground so far around a polygon belongs to the terrain below it."""
+_TERRAIN_CELL_M: Final = 0.25
+_LEAST_CELLS: Final = 8
 _POINTS_A_CELL: Final = 6.0
 _SMALLEST_CELL_M, _LARGEST_CELL_M = 0.05, 1.0
 _PARTS: Final = 8
@@ -128,6 +132,56 @@ class Toe:
 
     def sigma_m(self) -> float:
         """From the roughness of the edge."""
+        return self._sigma_m
+
+
+class Terrain:
+    """The bare ground within and around, filled where something stands on it: triangles through means of small cells.
+
+    Parameters
+    ----------
+    polygon : shapely.Polygon
+    ground_m : ndarray, shape (n, 3)
+        Points of the ground, within `AROUND_M` of the polygon.
+
+    Raises
+    ------
+    ValueError
+        There are too few.
+    """
+
+    def __init__(self, polygon: Any, ground_m: Array) -> None:
+        cells = Cells(_TERRAIN_CELL_M, {"mean", "count"})
+        cells.add(ground_m, ground_m[:, 2])
+        grid = cells.grid()
+        if grid is None:
+            raise ValueError("no ground")
+        heights = cells.window(grid, "mean").astype(np.float64)
+        known = np.isfinite(heights)
+        places = np.column_stack([_centres(grid)[known.ravel()], heights[known]])
+        if len(places) < _LEAST_CELLS or np.ptp(places[:, :2], axis=0).min() <= 0.0:
+            raise ValueError("too little ground")
+        self._linear = LinearNDInterpolator(places[:, :2], places[:, 2])
+        self._nearest = NearestNDInterpolator(places[:, :2], places[:, 2])
+        # every other cell from the rest: what triangles do not know of the ground between
+        odd = np.arange(len(places)) % 2 == 1
+        rest = np.asarray(LinearNDInterpolator(places[~odd, :2], places[~odd, 2])(places[odd, :2]))
+        off = places[odd, 2] - rest
+        rough = float(np.sqrt(np.nanmean(off**2) / 1.5)) if np.isfinite(off).any() else 0.0
+        # under the thing itself there may be no ground: it rests on what lies along its edge
+        edge = np.asarray(polygon.exterior.coords)[:-1, :2]
+        self._sigma_m = _mean_sigma(edge, rough)
+
+    def heights(self, xy_m: Array) -> Array:
+        """See `Base`."""
+        found = np.asarray(self._linear(xy_m))
+        beyond = ~np.isfinite(found)
+        if beyond.any():
+            found[beyond] = self._nearest(xy_m[beyond])
+        return found
+
+    def sigma_m(self) -> float:
+        """From the roughness of the ground."""
         return self._sigma_m
 
 

@@ -1,5 +1,6 @@
 """From a cloud and a file of polygons to volumes."""
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +11,30 @@ import numpy.typing as npt
 import shapely
 
 from flightlog.errors import CoverageError, UsageError
-from groundproc.analysis.volume import MARGIN_M, Base, Known, Plane, Toe, Volume, edge_heights, polygons_of, volume
+from groundproc.analysis import ground
+from groundproc.analysis.terrain.floor import GROUND
+from groundproc.analysis.volume import (
+    AROUND_M,
+    MARGIN_M,
+    Base,
+    Known,
+    Plane,
+    Terrain,
+    Toe,
+    Volume,
+    edge_heights,
+    polygons_of,
+    volume,
+)
 from groundproc.cloud import reader
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Window
-from groundproc.vectors.features import Features, read_features
+from groundproc.vectors.features import names_of, read_features
 
 Array = npt.NDArray[np.float64]
 
-BASES: Final = ("toe", "plane")
-_IDS: Final = ("id", "name", "ID", "Name")
+BASES: Final = ("toe", "plane", "dtm")
+_NONE: Final = np.empty((0, 3))
 _LONGEST_EDGE_M: Final = 50_000.0
 _EDGE_KNOWN: Final = 0.5
 """Share of the edge whose height has to be known."""
@@ -57,7 +72,7 @@ def measure(
     if cloud.horizontal is not None and features.crs is not None:
         features = features.into(cloud.horizontal)
     shapes = polygons_of(features.geometry)
-    ids = _ids(features)
+    ids = names_of(features)
     for name, each in zip(ids, shapes, strict=True):
         if each.geom_type != "Polygon" or not each.is_valid:
             raise UsageError(f"{polygons_path}: {name}: expected one polygon whose edge does not cross itself")
@@ -65,8 +80,11 @@ def measure(
             raise UsageError(
                 f"{polygons_path}: {name}: an edge of {each.exterior.length:,.0f} m found, expected {_LONGEST_EDGE_M:,.0f} m at most"
             )
-    points = _around(cloud, shapes, progress)
-    found = [_one(name, each, some, base) for name, each, some in zip(ids, shapes, points, strict=True)]
+    points = _around(cloud, shapes, MARGIN_M, progress)
+    bare = _ground(cloud, shapes, progress) if base == "dtm" else [_NONE] * len(shapes)
+    found = [
+        _one(name, each, some, below, base) for name, each, some, below in zip(ids, shapes, points, bare, strict=True)
+    ]
     if not any(each.volume for each in found):
         raise CoverageError(
             f"{polygons_path}: not one polygon can be measured; the first, {found[0].id}: {found[0].reason}"
@@ -74,33 +92,43 @@ def measure(
     return found, cloud
 
 
-def _ids(features: Features) -> list[str]:
-    """What the polygons are called: by their column id or name, else by number."""
-    for name in _IDS:
-        if name in features.columns:
-            values = features.columns[name]
-            return [str(value) if value not in (None, "") else str(n) for n, value in enumerate(values.tolist(), 1)]
-    return [str(n) for n in range(1, len(features) + 1)]
+def _ground(cloud: reader.Cloud, shapes: list[Any], progress: Callable[[int], object]) -> list[Array]:
+    """Points of the ground in and around each polygon: class 2 where the cloud has it, else as `swath ground` finds it."""
+    if "classification" in cloud.columns:
+        found = _around(cloud, shapes, AROUND_M, progress, GROUND)
+        if any(len(each) for each in found):
+            return found
+    with tempfile.TemporaryDirectory() as folder:
+        classed = Path(folder) / "ground.laz"
+        ground.work(ground.Task(cloud.path, classed), progress)
+        return _around(reader.look(classed), shapes, AROUND_M, progress, GROUND)
 
 
-def _around(cloud: reader.Cloud, shapes: list[Any], progress: Callable[[int], object]) -> list[Array]:
-    """Points of the cloud in and around each polygon."""
-    boxes = [shapely.box(*each.bounds).buffer(MARGIN_M, join_style="mitre").bounds for each in shapes]
+def _around(
+    cloud: reader.Cloud, shapes: list[Any], margin_m: float, progress: Callable[[int], object], only: int | None = None
+) -> list[Array]:
+    """Points of the cloud in and around each polygon; of one class, or all."""
+    boxes = [shapely.box(*each.bounds).buffer(margin_m, join_style="mitre").bounds for each in shapes]
     found: list[list[Array]] = [[] for _ in shapes]
-    for chunk in reader.chunks(cloud, columns=()):
-        xyz = chunk.points.xyz_m
+    for chunk in reader.chunks(cloud, columns=() if only is None else ("classification",)):
+        xyz = chunk.points.xyz_m if only is None else chunk.points.xyz_m[chunk.points["classification"] == only]
         for own, (west, south, east, north) in zip(found, boxes, strict=True):
             inside = (xyz[:, 0] >= west) & (xyz[:, 0] <= east) & (xyz[:, 1] >= south) & (xyz[:, 1] <= north)
             if inside.any():
                 own.append(xyz[inside])
-        progress(len(xyz))
+        progress(len(chunk.points.xyz_m))
     return [np.concatenate(parts) if parts else np.empty((0, 3)) for parts in found]
 
 
-def _one(name: str, polygon: Any, points_m: Array, base: str) -> Measured:
+def _one(name: str, polygon: Any, points_m: Array, ground_m: Array, base: str) -> Measured:
     if len(points_m) < 3:
         return Measured(name, None, "no points of the cloud within it")
-    if base in BASES:
+    if base == "dtm":
+        try:
+            found = volume(polygon, points_m, Terrain(polygon, ground_m))
+        except ValueError:
+            return Measured(name, None, f"only {len(ground_m)} points of ground within {AROUND_M:g} m of it")
+    elif base in BASES:
         edge, sigma = edge_heights(polygon, points_m)
         known = np.isfinite(edge[:, 2])
         if known.mean() < _EDGE_KNOWN:

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import tempfile
 from pathlib import Path
 
 HELP = "cut a slice out of a cloud, along a line"
@@ -14,7 +15,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
     parser.add_argument("--line", required=True, metavar="E,N,E,N", help="both ends, in the CRS of the cloud")
     parser.add_argument("--width", type=float, default=0.5, metavar="W", help="of the slice [m]; default: 0.5")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="a cloud, .laz or .las")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="a cloud (.laz, .las), a table (.csv) or a drawing (.dxf)",
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw it too, .png")
     parser.add_argument("--colour", default="z", metavar="NAME", help="attribute that colours it; default: z")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
@@ -27,23 +35,28 @@ def run(arguments: argparse.Namespace) -> int:
 
     from tqdm import tqdm
 
-    from groundproc.analysis.section import section
+    from groundproc.analysis.section import CLOUD_ENDINGS, ENDINGS, section
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file, write_json
     from groundproc.commands.values import numbers
 
     line = numbers(arguments.line, "--line", 4, "E,N,E,N")
     expect([arguments.cloud], CLOUD, CLOUD_WORDS)
-    claim_file(arguments.output, (".laz", ".las"), arguments.force, [arguments.cloud])
+    claim_file(arguments.output, ENDINGS, arguments.force, [arguments.cloud])
     for path, suffix in ((arguments.json, ".json"), (arguments.picture, ".png")):
         if path is not None:
             claim_file(path, (suffix,), arguments.force)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
         made = section(arguments.cloud, arguments.output, line, arguments.width, bar.update)
-    if arguments.picture is not None:
-        from groundproc.analysis.sectionplot import draw
+        if arguments.picture is not None:
+            from groundproc.analysis.sectionplot import draw
 
-        draw(arguments.output, arguments.picture, arguments.colour)
+            with tempfile.TemporaryDirectory(dir=arguments.output.parent) as folder:
+                drawn = arguments.output
+                if drawn.suffix.lower() not in CLOUD_ENDINGS:  # a picture is drawn of the slice as a cloud
+                    drawn = Path(folder) / "section.laz"
+                    section(arguments.cloud, drawn, line, arguments.width, bar.update)
+                draw(drawn, arguments.picture, arguments.colour)
     if arguments.json is not None:
         write_json(arguments.json, asdict(made))
     print(

@@ -37,8 +37,21 @@ def count(text: str, word: str) -> int:
     return int(text)
 
 
-def numbers(text: str, word: str, count: int, example: str) -> tuple[float, ...]:
-    """Numbers between commas, such as a place "533000,6472000".
+def classes(text: str, word: str) -> tuple[int, ...]:
+    """Classes of points between commas, such as "2,9".
+
+    Raises
+    ------
+    UsageError
+    """
+    found = tuple(int(each) if each.strip().isdecimal() else -1 for each in text.split(","))
+    if not all(0 <= each <= 255 for each in found):
+        raise UsageError(f"{word} {text!r}: expected classes of 0 to 255 between commas, such as 2,9")
+    return found
+
+
+def numbers(text: str, word: str, count: int | None, example: str) -> tuple[float, ...]:
+    """Numbers between commas, such as a place "533000,6472000"; so many, or any number of them.
 
     Raises
     ------
@@ -48,6 +61,7 @@ def numbers(text: str, word: str, count: int, example: str) -> tuple[float, ...]
         found = tuple(float(each) for each in text.split(","))
     except ValueError:
         found = ()
-    if len(found) != count or not all(map(math.isfinite, found)):
-        raise UsageError(f"{word} {text!r}: expected {count} numbers between commas, {example}")
+    if (not found if count is None else len(found) != count) or not all(map(math.isfinite, found)):
+        expected = "numbers" if count is None else f"{count} numbers"
+        raise UsageError(f"{word} {text!r}: expected {expected} between commas, {example}")
     return found

@@ -15,9 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
     parser.add_argument("polygons", type=Path, metavar="POLYGONS", help="GeoPackage or GeoJSON with a CRS")
     parser.add_argument(
-        "--base", default="toe", metavar="toe|plane|FILE.tif",
-        help="what volumes are counted from: triangles through the heights along the polygon's edge, the plane through them, or a "
-        "raster of heights; default: toe",
+        "--base", default="toe", metavar="toe|plane|dtm|FILE.tif",
+        help="what volumes are counted from: triangles through the heights along the polygon's edge, the plane through them, the "
+        "bare ground (class 2, or as swath ground finds it), or a raster of heights; default: toe",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)

@@ -1,6 +1,6 @@
-"""DXF: lines at heights and labels, on layers."""
+"""DXF: lines at heights, labels, points and triangles, on layers."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,15 +49,9 @@ def write_dxf(path: Path, lines: Sequence[Line], labels: Sequence[Label] = ()) -
     SourceError
         It cannot be written.
     """
-    from ezdxf import units
-    from ezdxf.document import Drawing
     from ezdxf.enums import TextEntityAlignment
 
-    drawing = Drawing.new("R2010")
-    drawing.units = units.M
-    space: Any = drawing.modelspace()
-    for layer in sorted({each.layer for each in lines} | {each.layer for each in labels}):
-        drawing.layers.add(layer)
+    drawing, space = _new({each.layer for each in lines} | {each.layer for each in labels})
     for line in lines:
         attributes = {"layer": line.layer}
         if line.places_m.shape[1] == 2:
@@ -69,6 +63,58 @@ def write_dxf(path: Path, lines: Sequence[Line], labels: Sequence[Label] = ()) -
             label.text, height=label.size_m, rotation=label.turn_deg, dxfattribs={"layer": label.layer}
         )
         text.set_placement(tuple(label.place_m.tolist()), align=TextEntityAlignment.MIDDLE_CENTER)
+    _write(path, drawing)
+
+
+def write_faces(path: Path, places_m: Array, triangles: npt.NDArray[np.int64], layer: str) -> None:
+    """Write triangles as 3D faces, in place (the caller writes aside).
+
+    Parameters
+    ----------
+    path : Path
+    places_m : ndarray, shape (n, 3)
+    triangles : ndarray of int64, shape (m, 3)
+        Rows of `places_m`.
+    layer : str
+
+    Raises
+    ------
+    SourceError
+        It cannot be written.
+    """
+    drawing, space = _new({layer})
+    for corners in places_m[triangles].tolist():
+        space.add_3dface(corners, dxfattribs={"layer": layer})
+    _write(path, drawing)
+
+
+def write_places(path: Path, places_m: Array, layers: Sequence[str]) -> None:
+    """Write points, shape (n, 3), each on a layer, in place (the caller writes aside).
+
+    Raises
+    ------
+    SourceError
+        It cannot be written.
+    """
+    drawing, space = _new(set(layers))
+    for place, layer in zip(places_m.tolist(), layers, strict=True):
+        space.add_point(place, dxfattribs={"layer": layer})
+    _write(path, drawing)
+
+
+def _new(layers: Iterable[str]) -> tuple[Any, Any]:
+    """An empty drawing in metres, and where its entities go."""
+    from ezdxf import units
+    from ezdxf.document import Drawing
+
+    drawing = Drawing.new("R2010")
+    drawing.units = units.M
+    for layer in sorted(layers):
+        drawing.layers.add(layer)
+    return drawing, drawing.modelspace()
+
+
+def _write(path: Path, drawing: Any) -> None:
     try:
         with path.open("w", encoding="utf-8") as file:
             drawing.write(file)

@@ -23,6 +23,8 @@ _DAMAGE: Final = (DataSourceError, DataLayerError, shapely.errors.ShapelyError, 
 
 
 _FARTHEST_M: Final = 1e8
+_NAMES: Final = ("id", "name", "ID", "Name")
+"""Columns that features are called by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,15 @@ def read_features(path: Path, kind: str) -> Features:
     except CRSError as error:
         raise CaptureError(f"{path}: its CRS cannot be understood ({error})") from None
     return Features(geometry, dict(zip(meta["fields"], fields, strict=True)), crs)
+
+
+def names_of(features: Features) -> list[str]:
+    """What features are called: by their column id or name, else by number."""
+    for name in _NAMES:
+        if name in features.columns:
+            values = features.columns[name]
+            return [str(value) if value not in (None, "") else str(n) for n, value in enumerate(values.tolist(), 1)]
+    return [str(n) for n in range(1, len(features) + 1)]
 
 
 def write_features(path: Path, features: Features, kind: str, layer: str, ending: str | None = None) -> None:

@@ -144,3 +144,42 @@ def test_what_cannot_be_measured_is_one_sentence(
     told = capsys.readouterr().err
     assert said in told
     assert told.count("\n") == 1
+
+
+def house(path: Path, classed: bool) -> Path:
+    """A block of 10 x 8 m and 5 m high on a slope; its walls are not seen."""
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, 60, (2, 60 * 40 * 40))
+    y *= 40 / 60
+    roof = (np.abs(x - 30) < 5) & (np.abs(y - 20) < 4)
+    z = np.where(roof, ground(np.array(30.0), np.array(20.0)) + 5.0, ground(x, y)) + rng.normal(0, 0.02, len(x))
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, [*ORIGIN, 0.0]
+    header.add_crs(pyproj.CRS.from_epsg(32633))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = x + ORIGIN[0], y + ORIGIN[1], z
+    las.classification = np.where(roof, 6, 2) if classed else np.ones(len(x), np.uint8)
+    las.write(path)
+    return path
+
+
+@pytest.mark.parametrize("classed", [True, False])
+def test_what_stands_on_the_ground_is_measured_from_the_ground(classed: bool, tmp_path: Path) -> None:
+    cloud = house(tmp_path / "c.laz", classed)
+    areas = polygons(tmp_path / "p.gpkg", {"house": shapely.box(24, 15, 36, 25)})
+    found = measured(tmp_path, cloud, areas, "--base", "dtm")["house"]
+    # the roof is flat and the ground slopes evenly: the mean height is that over the middle; each edge is known to half a cell
+    edge = 2 * (10 + 8) * 0.5 * 0.16 * 5.0
+    assert found["net_m3"] == pytest.approx(10 * 8 * 5.0, abs=edge + 3 * found["sigma_m3"])
+    assert 0.0 < found["sigma_m3"] < 10.0
+
+
+def test_a_cloud_without_ground_has_no_volume_above_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = house(tmp_path / "c.laz", True)
+    las = laspy.read(cloud)
+    las.classification[las.classification == 2] = 5
+    las.classification[np.hypot(las.x - ORIGIN[0] - 37, las.y - ORIGIN[1] - 20).argsort()[:3]] = 2
+    las.write(cloud)
+    areas = polygons(tmp_path / "p.gpkg", {"house": shapely.box(24, 15, 36, 25)})
+    assert main(["volume", str(cloud), str(areas), "--base", "dtm"]) in (1, 2)
+    assert "points of ground within 5 m" in capsys.readouterr().err

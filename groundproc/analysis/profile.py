@@ -1,0 +1,233 @@
+"""Heights along lines: of rasters between the centres of their cells, of clouds within a band around the line."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from flightlog.errors import CoverageError, UsageError
+from groundproc.cloud import reader
+from groundproc.raster import geotiff
+from groundproc.raster.grid import Grid, Window
+from groundproc.raster.sampling import bilinear
+
+Array = npt.NDArray[np.float64]
+
+MOST_STATIONS: Final = 1_000_000
+_NOISE: Final = (7, 18)
+"""Classes that are no surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line in plan, and stations on it.
+
+    Attributes
+    ----------
+    name : str
+    places_m : ndarray, shape (n, 2)
+        Its vertices.
+    along_m : ndarray, shape (m,)
+        Ways from its beginning to the stations.
+    stations_m : ndarray, shape (m, 2)
+    """
+
+    name: str
+    places_m: Array
+    along_m: Array
+    stations_m: Array
+
+
+@dataclass(slots=True)
+class Profile:
+    """Heights along one line, of one source.
+
+    Attributes
+    ----------
+    line : Line
+    source : str
+    height_m : ndarray, shape (m,)
+        At the stations; NaN where not known. Of a cloud the mean.
+    lowest_m, highest_m, sigma_m : ndarray, shape (m,)
+        Of the points of a cloud around a station; empty for rasters.
+    count : ndarray of int64, shape (m,)
+        Points; empty for rasters.
+    """
+
+    line: Line
+    source: str
+    height_m: Array
+    lowest_m: Array = field(default_factory=lambda: np.empty(0))
+    highest_m: Array = field(default_factory=lambda: np.empty(0))
+    sigma_m: Array = field(default_factory=lambda: np.empty(0))
+    count: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+
+
+def line_of(name: str, places_m: Array, step_m: float) -> Line:
+    """A line with stations a step apart, and one at its end.
+
+    Parameters
+    ----------
+    name : str
+    places_m : ndarray, shape (n, 2)
+    step_m : float
+
+    Raises
+    ------
+    UsageError
+        No length, no step, or too many stations.
+    """
+    shape = shapely.LineString(places_m) if len(places_m) > 1 else None
+    length = 0.0 if shape is None else float(shape.length)
+    if not (length > 0.0 and step_m > 0.0):
+        raise UsageError(
+            f"line {name}: {length:g} m long, with stations each {step_m:g} m; expected more than 0 of both"
+        )
+    if length / step_m > MOST_STATIONS:
+        raise UsageError(
+            f"line {name}: {length / step_m:,.0f} stations, expected at most {MOST_STATIONS:,}; take larger steps"
+        )
+    along = np.append(np.arange(0.0, length - 1e-9 * length, step_m), length)
+    return Line(name, places_m, along, shapely.get_coordinates(shapely.line_interpolate_point(shape, along)))
+
+
+def of_raster(path: Path, lines: Sequence[Line]) -> list[Profile]:
+    """Heights of a raster at the stations, bilinear between the centres of cells; NaN outside.
+
+    Raises
+    ------
+    CaptureError
+        It cannot be read.
+    """
+    found = []
+    with geotiff.opened(path) as raster:
+        for line in lines:
+            found.append(Profile(line, path.name, _sampled(raster, line.stations_m)))
+    return found
+
+
+def _sampled(raster: geotiff.Raster, xy_m: Array) -> Array:
+    """Piece by piece, so that a long line does not need the whole raster at once."""
+    grid, out = raster.grid, np.full(len(xy_m), np.nan)
+    column = (xy_m[:, 0] - raster.west_m) / grid.cell_m
+    down = (raster.north_m - xy_m[:, 1]) / grid.cell_m
+    within = (column >= 0) & (column < grid.columns) & (down >= 0) & (down < grid.rows)
+    tile = np.floor(np.column_stack([column, down]) / geotiff.BLOCK).astype(np.int64)
+    for key in np.unique(tile[within], axis=0):
+        some = within & (tile == key).all(axis=1)
+        left, top = key * geotiff.BLOCK - 1
+        side = geotiff.BLOCK + 2
+        values = raster.window(Window(grid.column + left, grid.row + grid.rows - top - side, side, side))
+        # in cells from the window's own corner, so that no grid of whole multiples is needed
+        local = np.column_stack([column[some] - left, side - (down[some] - top)])
+        frame = Grid(0, 0, side, side, 1.0)
+        inside = np.isfinite(values[np.floor(side - local[:, 1]).astype(int), np.floor(local[:, 0]).astype(int)])
+        out[some] = np.where(inside, bilinear(values, frame, local), np.nan)
+    return out
+
+
+def of_cloud(
+    path: Path, lines: Sequence[Line], width_m: float, classes: Sequence[int] | None, progress: Callable[[int], object]
+) -> list[Profile]:
+    """Means, extremes and scatter of the points nearest to each station, within half a width of the line.
+
+    Parameters
+    ----------
+    path : Path
+    lines : sequence of Line
+    width_m : float
+    classes : sequence of int, optional
+        Only points of these; default: all but noise.
+    progress : callable
+        Told of points done.
+
+    Raises
+    ------
+    UsageError
+        The width is not positive.
+    CoverageError
+        The cloud has no classes though some are asked for, or no point is near any line.
+    """
+    if not width_m > 0.0:
+        raise UsageError(f"--width {width_m:g}: expected more than 0")
+    cloud = reader.look(path)
+    classed = "classification" in cloud.columns
+    if classes is not None and not classed:
+        raise CoverageError(f"{path}: its points have no classes, expected classes {', '.join(map(str, classes))}")
+    sums = [_Sums(line) for line in lines]
+    for chunk in reader.chunks(cloud, columns=("classification",) if classed else ()):
+        xyz = chunk.points.xyz_m
+        if classed:
+            kind = chunk.points["classification"]
+            xyz = xyz[np.isin(kind, classes) if classes is not None else ~np.isin(kind, _NOISE)]
+        for each in sums:
+            each.add(xyz, width_m)
+        progress(len(chunk.points.xyz_m))
+    if not any(each.count.any() for each in sums):
+        raise CoverageError(f"{path}: no point lies within {width_m / 2.0:g} m of a line")
+    return [each.profile(path.name) for each in sums]
+
+
+class _Sums:
+    """What is kept of the points around the stations of one line."""
+
+    def __init__(self, line: Line) -> None:
+        self.line, self.shape = line, shapely.LineString(line.places_m)
+        shapely.prepare(self.shape)
+        size = len(line.along_m)
+        self.count = np.zeros(size, np.int64)
+        self.total, self.squares = np.zeros(size), np.zeros(size)
+        self.low, self.high = np.full(size, np.inf), np.full(size, -np.inf)
+        self.base: float | None = None
+        # half way between stations the next one's points begin
+        self.borders = (line.along_m[1:] + line.along_m[:-1]) / 2.0
+
+    def add(self, xyz: Array, width_m: float) -> None:
+        west, south, east, north = self.shape.bounds
+        half = width_m / 2.0
+        x, y = xyz[:, 0], xyz[:, 1]
+        xyz = xyz[(x >= west - half) & (x <= east + half) & (y >= south - half) & (y <= north + half)]
+        if not len(xyz):
+            return
+        xyz = xyz[shapely.dwithin(self.shape, shapely.points(xyz[:, :2]), half)]
+        if not len(xyz):
+            return
+        along = shapely.line_locate_point(self.shape, shapely.points(xyz[:, :2]))
+        # what lies beyond an end is nearest to the end itself, and no part of the line
+        station = np.searchsorted(self.borders, along)
+        inner = ~self._beyond(xyz, along)
+        station, z = station[inner], xyz[inner, 2]
+        if self.base is None and len(z):
+            self.base = float(z[0])  # squares of small numbers keep their digits
+        d = z - (self.base or 0.0)
+        size = len(self.count)
+        self.count += np.bincount(station, minlength=size)
+        self.total += np.bincount(station, d, size)
+        self.squares += np.bincount(station, d**2, size)
+        np.minimum.at(self.low, station, z)
+        np.maximum.at(self.high, station, z)
+
+    def _beyond(self, xyz: Array, along: Array) -> npt.NDArray[np.bool_]:
+        places = self.line.places_m
+        first, last = places[1] - places[0], places[-1] - places[-2]
+        before = (along <= 0.0) & ((xyz[:, :2] - places[0]) @ first < 0.0)
+        after = (along >= self.line.along_m[-1]) & ((xyz[:, :2] - places[-1]) @ last > 0.0)
+        return np.asarray(before | after)
+
+    def profile(self, source: str) -> Profile:
+        seen = self.count > 0
+        number = np.maximum(self.count, 1)
+        mean = self.total / number
+        spread = np.sqrt(np.maximum(self.squares / number - mean**2, 0.0) * number / np.maximum(number - 1, 1))
+        sigma = np.where(self.count > 1, spread, np.nan)
+
+        def known(values: Array) -> Array:
+            return np.where(seen, values, np.nan)
+
+        return Profile(
+            self.line, source, known(mean + (self.base or 0.0)), known(self.low), known(self.high), sigma, self.count
+        )
