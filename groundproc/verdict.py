@@ -342,7 +342,7 @@ def _points(quality: Figures) -> Iterator[Reason]:
     if not points["written"]:
         yield Reason(BAD, "points", "not one point was written")
     dropped = points["shots_dropped"]
-    shots = points["written"] + sum(dropped.values())
+    shots = points["written"] + sum(dropped.values()) + sum(points.get("left_out", {}).values())
     outside = _share(lidar["packets_outside_every_leg"], lidar["packets"])
     without = 1.0 - (1.0 - outside) * (1.0 - _share(dropped["no_pose"], shots))
     if without > WITHOUT_POSE:

@@ -17,12 +17,13 @@ import shapely
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from groundproc.analysis.terrain.building import outlines, roofs
-from groundproc.analysis.terrain.floor import FILL_M, GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED, Floor
+from groundproc.analysis.terrain.floor import FILL_M, Floor
 from groundproc.analysis.terrain.holdout import HoldOut
 from groundproc.analysis.terrain.settings import Settings, settings_for
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.analysis.terrain.water import read_water
 from groundproc.cloud import reader
+from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff

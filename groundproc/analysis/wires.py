@@ -22,8 +22,9 @@ from groundproc.analysis.corridor.poles import HALO_M, Pole, upright
 from groundproc.analysis.corridor.spans import conductors
 from groundproc.analysis.corridor.strips import FENCE_HEIGHTS_M, fence, stay
 from groundproc.analysis.corridor.thin import RADIUS_M, thin_points
-from groundproc.analysis.terrain.floor import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED, Floor
+from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
+from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Tiles, side_for
 from groundproc.files import written_aside

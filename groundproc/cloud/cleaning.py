@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from groundproc.cloud.classes import HIGH_NOISE, LOW_NOISE, MOVING, UNCLASSIFIED
 from groundproc.cloud.freespace import AFTER, BEFORE, BETWEEN, SAME, Evidence
 from groundproc.cloud.surroundings import Surroundings, Voxels, beside, find, has_plane, middle_of, off_plane
 from groundproc.numerics.voxelhash import voxel_key
@@ -21,12 +22,6 @@ from groundproc.numerics.voxelhash import voxel_key
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
 Bytes = npt.NDArray[np.uint8]
-
-UNCLASSIFIED: Final = 1
-LOW_NOISE: Final = 7
-HIGH_NOISE: Final = 18
-MOVING: Final = 64
-"""Of the range that is the user's (LAS 1.4 R15, table 17); the others are ASPRS classes."""
 
 SEED_LOOKS: Final = 8
 COMPANY: Final = 2

@@ -1,6 +1,6 @@
 """The stage that makes the cloud: every shot given its pose, placed, projected and handed on; and what became of each."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -12,6 +12,7 @@ from flightlog.mount import Mount
 from groundproc import geodesy
 from groundproc.cloud import georeference
 from groundproc.cloud.points import Dropped, Points
+from groundproc.cloud.selection import Selection
 from groundproc.sensors.shots import Shots
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -21,10 +22,11 @@ FARTHEST_M: Final = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """How many points were placed, and what became of the other shots."""
+    """How many points were handed on, what became of the other shots, and what was left out by choice."""
 
     points: int
     dropped: Dropped
+    left_out: Mapping[str, int]
 
 
 class Sink(Protocol):
@@ -48,7 +50,11 @@ def placed(shots: Iterable[Shots], trajectory: Trajectory, mount: Mount) -> Iter
 
 
 def handed_on(
-    pieces: Iterable[Points], trajectory: Trajectory, projection: geodesy.Projection, sinks: Sequence[Sink]
+    pieces: Iterable[Points],
+    trajectory: Trajectory,
+    projection: geodesy.Projection,
+    sinks: Sequence[Sink],
+    selection: Selection,
 ) -> Placed:
     """Project points of the flight's frame and hand them to the sinks, piece by piece.
 
@@ -61,6 +67,8 @@ def handed_on(
     projection : geodesy.Projection
         From the trajectory's frame.
     sinks : sequence of Sink
+    selection : Selection
+        Which of the projected points are wanted.
 
     Raises
     ------
@@ -73,16 +81,30 @@ def handed_on(
     for points in pieces:
         dropped = dropped + points.dropped
         if len(points):
-            count += len(points)
             project(points, projection)
+            points = selection.of(points)
+        if len(points):
+            count += len(points)
             for sink in sinks:
                 sink.add(points)
         del points  # the next piece takes their memory
+    if not count and any(selection.left_out.values()):
+        raise CoverageError(_all_left_out(selection, trajectory))
     if not count:
         raise CoverageError(f"not one shot gives a point: {_why_nothing(dropped, trajectory)}")
     for sink in sinks:
         sink.finish()
-    return Placed(count, dropped)
+    return Placed(count, dropped, dict(selection.left_out))
+
+
+def _all_left_out(selection: Selection, trajectory: Trajectory) -> str:
+    """Which choices left no point."""
+    told = ", ".join(f"{count:,} by {name}" for name, count in selection.left_out.items() if count)
+    start, end = int(trajectory.time_ns[0]), int(trajectory.time_ns[-1])
+    return (
+        f"not one point is left: {told}; expected a choice that some points meet; the flight goes from {utc_text(start)} to "
+        f"{utc_text(end)}, {(end - start) * 1e-9:.1f} s"
+    )
 
 
 def _why_nothing(dropped: Dropped, trajectory: Trajectory) -> str:

@@ -4,7 +4,7 @@ import contextlib
 import logging
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from groundproc.cloud import lashead, laz
 from groundproc.cloud.dimensions import TABLE, Dimension, in_order
 from groundproc.cloud.gpstime import Clock, is_week_time
 from groundproc.cloud.points import Points
+from groundproc.cloud.selection import Choice, Selection
 
 CHUNK: Final = 1_000_000
 """Points that are in memory at once, unless they are very large."""
@@ -57,6 +58,8 @@ class Cloud:
         Times are seconds of the GPS week; else adjusted standard GPS time. As the header says, unless the times cannot be that.
     crs : pyproj.CRS or None
         As the file states it.
+    choices : tuple of Choice
+        Which of its points `chunks` gives; all where there are none.
     """
 
     path: Path
@@ -65,6 +68,7 @@ class Cloud:
     timed: bool
     week_time: bool
     crs: pyproj.CRS | None
+    choices: tuple[Choice, ...] = ()
 
     @property
     def horizontal(self) -> pyproj.CRS | None:
@@ -88,8 +92,14 @@ class Chunk:
     record: Any
 
 
-def look(path: Path) -> Cloud:
+def look(path: Path, *choices: Choice) -> Cloud:
     """Read a header.
+
+    Parameters
+    ----------
+    path : Path
+    choices : Choice
+        Which points of it are wanted, such as `selection.SURFACES`; default: all.
 
     Raises
     ------
@@ -108,11 +118,13 @@ def look(path: Path) -> Cloud:
             # many programs leave the bit unset with times that no week has
             time = np.asarray(next(_records(path, reader)).gps_time, np.float64)
             weekly = is_week_time(time)
-        return Cloud(path, header.point_count, columns, timed, weekly, crs)
+        return Cloud(path, header.point_count, columns, timed, weekly, crs, choices)
 
 
-def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None) -> Iterator[Chunk]:
-    """All points of a file.
+def chunks(
+    cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None, selection: Selection | None = None
+) -> Iterator[Chunk]:
+    """All points of a file that are wanted.
 
     Parameters
     ----------
@@ -121,6 +133,8 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
         How its times become UTC. None: times are not asked for, and `time_ns` is 0.
     columns : collection of str, optional
         Those wanted, of `cloud.columns`; default: all.
+    selection : Selection, optional
+        Counts what is left out; default: one of the cloud's own choices, whose counts nobody sees.
 
     Raises
     ------
@@ -129,6 +143,9 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
     """
     if clock is not None and not cloud.timed:
         raise CaptureError(f"{cloud.path}: its points have no gps_time, expected the time of each point")
+    selection = Selection(cloud.choices) if selection is None else selection
+    asked = cloud.columns if columns is None else columns
+    needed = {*asked, *(name for each in selection.choices for name in each.columns)}
     with opened(cloud.path) as reader:
         seen = 0
         for record in _records(cloud.path, reader):
@@ -138,9 +155,20 @@ def chunks(cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | 
                 time_s = np.asarray(record.gps_time, np.float64)
                 clock = clock.begun(time_s) if cloud.week_time else clock
                 time_ns = clock.utc_ns(cloud.path, cloud.week_time, time_s)
-            yield Chunk(points_of(cloud, record, time_ns, columns), record)
+            points = points_of(cloud, record, time_ns, needed)
+            wanted = selection.mask(points)
+            if wanted is not None:
+                points, record = points.masked(wanted), record[wanted]
+            yield Chunk(_only(points, asked), record)
         if seen != cloud.points:
             raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
+
+
+def _only(points: Points, names: Collection[str]) -> Points:
+    """The points with some of their columns."""
+    if set(points.columns) <= set(names):
+        return points
+    return replace(points, columns={name: values for name, values in points.columns.items() if name in names})
 
 
 def points_of(

@@ -1,7 +1,9 @@
 """`swath export`: a cloud or a trajectory in another format."""
 
 import argparse
+import contextlib
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +14,7 @@ _TRAJECTORY_KINDS: Final = ("poses", "solution")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_selection
 
     parser.add_argument(
         "source", type=Path, metavar="FILE",
@@ -29,7 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--geoid", metavar="M|GRID",
         help="height of the geoid above the ellipsoid [m], or a grid file: heights above sea level become those above the ellipsoid",
     )  # fmt: skip
-    parser.add_argument("--week", type=int, metavar="N", help="GPS week of an SBET that is read")
+    parser.add_argument(
+        "--week",
+        type=int,
+        metavar="N",
+        help="GPS week of an SBET that is read, or of a cloud whose times are seconds of the week",
+    )
+    add_selection(parser)
     add_force(parser)
 
 
@@ -51,7 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
     poses = kind is not None and kind.name in _TRAJECTORY_KINDS
     if suffix in TRAJECTORIES and (poses or not clouds):
         return _trajectory(arguments)
-    given = {"--height": arguments.height, "--geoid": arguments.geoid, "--week": arguments.week}
+    given = {"--height": arguments.height, "--geoid": arguments.geoid}
+    if arguments.times is None:
+        given["--week"] = arguments.week
     for word, value in given.items():
         if value is not None and not poses:
             raise UsageError(f"{word}: is for a trajectory, and {arguments.source} is to be written as a cloud")
@@ -59,12 +70,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _cloud(arguments: argparse.Namespace) -> int:
-    """Write a cloud, with a progress bar on a terminal."""
+    """Write a cloud or part of it, with a progress bar on a terminal."""
+    from dataclasses import replace
+
     from tqdm import tqdm
 
     from groundproc.cloud import exports, reader
+    from groundproc.cloud.gpstime import Clock
+    from groundproc.cloud.part import write_part
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
+    from groundproc.commands.selecting import asked, choices_of
     from groundproc.files import written_aside
 
     output = arguments.output
@@ -73,20 +89,38 @@ def _cloud(arguments: argparse.Namespace) -> int:
         output, [f".{ending.rpartition('.')[2]}" for ending in exports.FORMATS], arguments.force, [arguments.source]
     )
     cloud = reader.look(arguments.source)
-    bar = tqdm(total=cloud.points, unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty())
-    with bar, written_aside(output) as aside:
+    left_out: Mapping[str, int] = {}
+    bar = tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty())
+    with contextlib.ExitStack() as stack:
+        aside = stack.enter_context(written_aside(output))
+        stack.enter_context(bar)
+        if asked(arguments):
+            clock = Clock(week=arguments.week)
+            cloud = replace(cloud, choices=tuple(choices_of(arguments, cloud, clock, bar.update)))
+            part = stack.enter_context(_removed(aside.with_name(f"{aside.name}.laz")))
+            left_out = write_part(cloud, part, clock if arguments.times is not None else None, bar.update)
+            cloud = reader.look(part)
         exports.write(cloud, output, aside, bar.update)
-    print(f"{cloud.points:,} points in {output}")
+    told = ", ".join(f"{count:,} by {name}" for name, count in left_out.items())
+    print(f"{cloud.points:,} points in {output}" + (f"; left out: {told}" if told else ""))
     return 0
+
+
+@contextlib.contextmanager
+def _removed(path: Path) -> Iterator[Path]:
+    """A file for the time of the work."""
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
 
 
 def _trajectory(arguments: argparse.Namespace) -> int:
     """Write a trajectory; the file that was named appears last."""
-    import contextlib
-
     from flightlog.errors import UsageError
     from groundproc.commands.inputs import expect
     from groundproc.commands.outputs import claim_file
+    from groundproc.commands.selecting import asked
     from groundproc.files import written_aside
     from groundproc.trajectory import exports
     from groundproc.trajectory.exports.source import read_source
@@ -97,6 +131,8 @@ def _trajectory(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--geoid {arguments.geoid}: is for .sbet, .out and .pos; {arguments.output.suffix} keeps the heights as they are"
         )
+    if asked(arguments):
+        raise UsageError("--times, --area, --lines and --without-classes: are for a cloud, expected no trajectory")
     writers = exports.writers(arguments.output)
     for path in writers:
         suffixes = tuple(exports.FORMATS) if path == arguments.output else (path.suffix.lower(),)

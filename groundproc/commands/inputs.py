@@ -16,6 +16,8 @@ CLOUD: Final = ("cloud",)
 CLOUD_WORDS: Final = "a cloud (LAS, LAZ or COPC)"
 RASTER: Final = ("picture",)
 RASTER_WORDS: Final = "a raster of heights (GeoTIFF)"
+AREA: Final = ("features", "json", "text")
+AREA_WORDS: Final = "polygons (GeoPackage or GeoJSON)"
 _NAMES: Final = 2000
 """Names of a folder that are looked through for one like that which was typed."""
 

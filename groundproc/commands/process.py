@@ -125,7 +125,7 @@ def _expect(arguments: argparse.Namespace) -> None:
 
 def _expect_named(survey: Survey) -> None:
     """The same for the files that a survey names."""
-    from groundproc.commands.inputs import SOLUTION_WORDS, SOLUTIONS, expect, expect_text
+    from groundproc.commands.inputs import AREA, AREA_WORDS, SOLUTION_WORDS, SOLUTIONS, expect, expect_text
     from groundproc.sensors.lasers import ESTIMATE
 
     lasers = None if survey.lasers == ESTIMATE else survey.lasers
@@ -134,6 +134,7 @@ def _expect_named(survey: Survey) -> None:
     expect_text(survey.compass, "a file of `swath calibrate` or `swath compass` (YAML)")
     expect_text(lasers, "a file of `swath calibrate --lasers` (YAML)")
     for name, kinds, expected in (
+        (survey.area, AREA, AREA_WORDS),
         (survey.positions, (*SOLUTIONS, "table", "text"), SOLUTION_WORDS),
         (survey.control, ("control", "table", "text"), "a table of control points (CSV: x, y, z, sigma)"),
     ):
@@ -189,6 +190,7 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
     east, north, up = track["median_sigma_m"]
     lines = [
         f"{points['written']:,} points in EPSG:{crs['epsg']} ({crs['name']}), heights {height['meaning']}",
+        *_left_out(points.get("left_out", {})),
         f"trajectory by {track['method']}: {track['covered_s']:.1f} s from {track['start']}, "
         f"sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)"
         + (f"; {track['note']}" if track["note"] else ""),
@@ -200,6 +202,11 @@ def _report(quality: dict[str, Any], folder: Path) -> str:
         *_where(folder),
     ]
     return "\n".join(lines)
+
+
+def _left_out(counts: dict[str, int]) -> list[str]:
+    """What the survey did not want, where it chose."""
+    return [f"left out: {', '.join(f'{count:,} by {name}' for name, count in counts.items())}"] if counts else []
 
 
 def _where(folder: Path) -> list[str]:

@@ -87,6 +87,7 @@ SURVEY: Final = Kind("survey", "a survey file", "`swath process LOG --config {} 
 YAML: Final = Kind("yaml", "a text with keys and values (YAML)")
 JSON: Final = Kind("json", "a JSON file")
 BAG: Final = Kind("bag", "a ROS bag", "`swath import --bag {} -o LOG.mcap` makes a flight log of it")
+FEATURES: Final = Kind("features", "a GeoPackage", "`swath volume CLOUD {}` measures within its polygons")
 GZIP: Final = Kind("gzip", "compressed with gzip", "`gunzip {}` unpacks it")
 ARCHIVE: Final = Kind("archive", "an archive (zip, or arrays of numpy)")
 PICTURE: Final = Kind("picture", "a picture")
@@ -95,6 +96,9 @@ EMPTY: Final = Kind("empty", "empty")
 PRODUCTS: Final = Kind("products", "a folder of products", "`swath process {}` goes on with it")
 FOLDER: Final = Kind("folder", "a folder")
 
+_SQLITE: Final = b"SQLite format 3\x00"
+_GEOPACKAGE_AT: Final = 68
+"""Where a database says whose it is: GPKG, or GP10 and GP11 of the first versions."""
 _MAGICS: Final[tuple[tuple[bytes, Kind], ...]] = (
     (MAGIC, LOG),
     (b"\xd4\xc3\xb2\xa1", CAPTURE),
@@ -104,7 +108,7 @@ _MAGICS: Final[tuple[tuple[bytes, Kind], ...]] = (
     (b"\x0a\x0d\x0d\x0a", CAPTURE),
     (b"LASF", CLOUD),
     (b"#ROSBAG", BAG),
-    (b"SQLite format 3\x00", BAG),
+    (_SQLITE, BAG),
     (b"PK\x03\x04", ARCHIVE),
     (b"ULog\x01", Kind("ulog", "a log of PX4", "swath reads ArduPilot's logs: .tlog and .bin")),
     (b"\x89PNG", PICTURE),
@@ -146,6 +150,8 @@ def of_head(head: bytes, size: int) -> Kind | None:
     """What a file is by its first bytes and its size [bytes]."""
     if not head:
         return EMPTY
+    if head.startswith(_SQLITE) and head[_GEOPACKAGE_AT : _GEOPACKAGE_AT + 2] == b"GP":
+        return FEATURES
     for magic, kind in _MAGICS:
         if head.startswith(magic):
             return kind

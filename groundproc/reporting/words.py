@@ -106,9 +106,13 @@ def losses(quality: Quality) -> Html:
     """Everything that was dropped or could not be read, by name; what is zero is said too."""
     points, lidar, pilot = quality["points"], quality["lidar"], quality["autopilot"]
     dropped = points["shots_dropped"]
-    shots = points["written"] + sum(dropped.values())
+    left_out = points.get("left_out", {})
+    shots = points["written"] + sum(dropped.values()) + sum(left_out.values())
     rows: list[Row] = [
         (f"Shots with {_SHOTS.get(name, name)}", count(number), _of(number, shots)) for name, number in dropped.items()
+    ]
+    rows += [
+        (f"Points left out by choice: {name}", count(number), _of(number, shots)) for name, number in left_out.items()
     ]
     packets = lidar["packets"]
     outside = lidar["packets_outside_every_leg"]

@@ -29,10 +29,12 @@ from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
+from groundproc.steps.trim import check_times, selection_of
 from groundproc.strips.cutting import line_begins_ns
 from groundproc.strips.options import StripOptions
-from groundproc.survey import AttributeSettings, PlacingSettings, Survey, section
+from groundproc.survey import AttributeSettings, PlacingSettings, Survey, TrimSettings, section
 from groundproc.trajectory.estimate import Estimate
+from groundproc.vectors.features import read_features
 
 FOUND: Final = f"{INSIDE}/place.json"
 """What quality.json says of shots and points."""
@@ -41,11 +43,17 @@ FOUND: Final = f"{INSIDE}/place.json"
 def settings(request: Request) -> Mapping[str, Any]:
     """The window of shots, what is said of each point, the CRS, and what heights refer to."""
     survey = request.survey
-    return section(survey, PlacingSettings, AttributeSettings) | {
+    return section(survey, PlacingSettings, AttributeSettings, TrimSettings) | {
         "crs": survey.crs,
         "crs_anyway": survey.crs_anyway,
         "height": survey.height,
     }
+
+
+def files(request: Request) -> Mapping[str, Path]:
+    """The file of the area, if there is one."""
+    area = request.survey.area
+    return {} if area is None else {"area": Path(area)}
 
 
 def parts(request: Request) -> Mapping[str, Any]:
@@ -58,6 +66,11 @@ def check(request: Request) -> None:
     survey = request.survey
     chosen(survey.products)
     attributes.wanted(survey.attributes)
+    check_times(survey.times)
+    if survey.area is not None:
+        read_features(Path(survey.area), "Polygon")
+    elif survey.area_keeps == "outside":
+        raise UsageError("area_keeps: outside given, but nothing uses it; expected with an area")
     if survey.crs is not None:
         geodesy.projected_crs(survey.crs)
     elif survey.crs_anyway:
@@ -99,7 +112,7 @@ def work(run: Run, folders: Folders) -> None:
         seen = shots(run.readers, timeline, gate, lasers, next(tallies), told)
         return placing.placed(seen, made.trajectory, made.mount)
 
-    found = attributes.Found()
+    found, selection = attributes.Found(), selection_of(survey, made.trajectory, projection.crs)
     lines = line_begins_ns(made.trajectory, StripOptions().turn_deg)
     scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging, lines)
     with contextlib.ExitStack() as stack:
@@ -110,7 +123,7 @@ def work(run: Run, folders: Folders) -> None:
                 sinks += stack.enter_context(streamed([each], own))
         try:
             described = attributes.described(stream, scene, names, found)
-            placed = placing.handed_on(described, made.trajectory, projection, sinks)
+            placed = placing.handed_on(described, made.trajectory, projection, sinks, selection)
         except CoverageError:
             if tally.packets:
                 raise
@@ -172,6 +185,7 @@ def _tell(
             "written": placed.points,
             "range_step_m": lidar.range_step_m,
             "shots_dropped": asdict(placed.dropped),
+            "left_out": dict(placed.left_out),
         }
         | seen.tell(),
     }
@@ -186,6 +200,7 @@ STEP: Final = Step(
     reads_logs=True,
     settings=settings,
     work=work,
+    files=files,
     check=check,
     parts=parts,
 )

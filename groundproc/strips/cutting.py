@@ -1,6 +1,7 @@
 """Strips: stretches of time between which surfaces are compared."""
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -20,6 +21,8 @@ BIN_NS: Final = 100_000_000
 """Time is looked at in bins of this length."""
 WINDOW_S: Final = 6.0
 """A turn is what changes the course within this time."""
+_HALF: Final = int(WINDOW_S / 2 * 1e9 / BIN_NS)
+"""Bins of half of that."""
 _WIDE_RAD: Final = np.deg2rad(100.0)
 _PAUSE_NS: Final = 60_000_000_000
 """Between two poses: who has not flown for so long begins another line."""
@@ -128,32 +131,26 @@ def line_begins_ns(trajectory: Trajectory, turn_deg: float) -> Ints:
     The middle of each turn, as strips are cut, and the end of a pause: so work follows the poses, and not the time between two of them.
     """
     begins: list[Ints] = []
-    edges = [0, *(np.flatnonzero(np.diff(trajectory.time_ns) > _PAUSE_NS) + 1), len(trajectory)]
-    for first, last in itertools.pairwise(edges):
-        part = trajectory.part(slice(int(first), int(last)))
-        start_ns = int(part.time_ns[0])
-        bins = int((part.time_ns[-1] - start_ns) // BIN_NS) + 1
-        if first:
+    for part, start_ns, bins in flown(trajectory):
+        if begins:
             begins.append(np.array([start_ns], np.int64))
         begins.append(start_ns + BIN_NS * turns(part, start_ns, bins, turn_deg))
     return np.concatenate(begins)
 
 
+def flown(trajectory: Trajectory) -> Iterator[tuple[Trajectory, int, int]]:
+    """Pieces of a flight without long pauses: poses, when the first bin begins, and the number of bins."""
+    edges = [0, *(np.flatnonzero(np.diff(trajectory.time_ns) > _PAUSE_NS) + 1), len(trajectory)]
+    for first, last in itertools.pairwise(edges):
+        part = trajectory.part(slice(int(first), int(last)))
+        start_ns = int(part.time_ns[0])
+        yield part, start_ns, int((part.time_ns[-1] - start_ns) // BIN_NS) + 1
+
+
 def turns(poses: Trajectory, start_ns: int, bins: int, turn_deg: float) -> Ints:
     """Bins in the middle of turns, of so many from a time on."""
-    times = start_ns + np.arange(bins) * BIN_NS
-    place = np.clip(np.searchsorted(poses.time_ns, times), 0, len(poses) - 1)
-    per_s = 1e9 / BIN_NS
-    velocity = gaussian_filter1d(poses.velocity_m_s[place, :2], per_s, axis=0, mode="nearest")
-    course = np.arctan2(velocity[:, 0], velocity[:, 1])
-    fast = np.hypot(velocity[:, 0], velocity[:, 1]) > _SLOWEST_M_S
-    if not fast.any():
-        return np.zeros(0, np.int64)
-    course = course[np.maximum.accumulate(np.where(fast, np.arange(bins), np.argmax(fast)))]
-    half = int(WINDOW_S / 2 * per_s)
-    course = np.unwrap(course)
-    padded = np.pad(course, half, mode="edge")
-    change = np.abs(padded[2 * half :] - padded[: -2 * half])
+    course, change = courses(velocities(poses, start_ns, bins))
+    half = _HALF
     cuts, _ = find_peaks(change, height=np.deg2rad(turn_deg), prominence=np.deg2rad(turn_deg) / 4, distance=half)
     found = cuts.tolist()
     # a wide turn or a circle has no peak: what turns in its inner part is cut where the course is half-way
@@ -168,6 +165,29 @@ def turns(poses: Trajectory, start_ns: int, bins: int, turn_deg: float) -> Ints:
         found.append(middle)
         left += [(start, middle), (middle, end)]
     return np.array(sorted(found), np.int64)
+
+
+def velocities(poses: Trajectory, start_ns: int, bins: int) -> Array:
+    """Smoothed velocity in each bin, shape (bins, 3): over a second, what gusts do is gone."""
+    times = start_ns + np.arange(bins) * BIN_NS
+    place = np.clip(np.searchsorted(poses.time_ns, times), 0, len(poses) - 1)
+    smooth = gaussian_filter1d(poses.velocity_m_s[place], 1e9 / BIN_NS, axis=0, mode="nearest")
+    return np.asarray(smooth, np.float64)
+
+
+def courses(velocity_m_s: Array) -> tuple[Array, Array]:
+    """Course in each bin [rad], unwrapped, and by how much it changes within `WINDOW_S` around, shape (bins,) each.
+
+    Who stands keeps the course that he had; who never flies has none, and all is 0.
+    """
+    bins = len(velocity_m_s)
+    fast = np.hypot(velocity_m_s[:, 0], velocity_m_s[:, 1]) > _SLOWEST_M_S
+    if not fast.any():
+        return np.zeros(bins), np.zeros(bins)
+    course = np.arctan2(velocity_m_s[:, 0], velocity_m_s[:, 1])
+    course = np.unwrap(course[np.maximum.accumulate(np.where(fast, np.arange(bins), np.argmax(fast)))])
+    padded = np.pad(course, _HALF, mode="edge")
+    return course, np.abs(padded[2 * _HALF :] - padded[: -2 * _HALF])
 
 
 def headings_differ(route: Route, strips: Strips) -> float:

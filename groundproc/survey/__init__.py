@@ -168,6 +168,45 @@ class AttributeSettings:
 
 
 @dataclass(frozen=True)
+class TrimSettings:
+    """Trim: which part of the flight goes into the products; what is left out is counted, and still tells of what is around it."""
+
+    times: tuple[str, ...] | None = setting(
+        None,
+        "spans of time kept, START/END: seconds of the flight (60/480) or UTC (2026-05-01T10:02:00Z/2026-05-01T10:09:30Z); an end may be "
+        "left open (60/)",
+        words=("--times",),
+        metavar="SPANS",
+        reads="names",
+        absent="all of it",
+        in_file="a list",
+    )
+    area: str | None = setting(
+        None,
+        "polygons on the map (GeoPackage or GeoJSON, in any CRS that they state)",
+        words=("--area",),
+        metavar="FILE",
+        reads="file",
+        absent="none",
+        in_file=BESIDE,
+    )
+    area_keeps: str = setting(
+        "inside",
+        "what of the points is kept where there is an area",
+        words=("--area-keeps",),
+        choices=("inside", "outside"),
+    )
+    without_turns: bool = setting(
+        False, "leave out turns: what changes the course by 45 deg or more within 6 s", words=("--without-turns",)
+    )
+    without_ends: bool = setting(
+        False,
+        "leave out take-off and landing: before the first and after the last steady flight",
+        words=("--without-ends",),
+    )
+
+
+@dataclass(frozen=True)
 class OutputSettings:
     """Output: which products, and their coordinates and heights."""
 
@@ -202,13 +241,23 @@ class OutputSettings:
 
 
 @dataclass(frozen=True)
-class Survey(OutputSettings, AttributeSettings, PlacingSettings, TrajectorySettings, ClockSettings, MountSettings):
+class Survey(
+    OutputSettings, TrimSettings, AttributeSettings, PlacingSettings, TrajectorySettings, ClockSettings, MountSettings
+):
     """All that can be chosen: the options of `swath process`."""
 
 
-SECTIONS: Final = (MountSettings, ClockSettings, TrajectorySettings, PlacingSettings, AttributeSettings, OutputSettings)
+SECTIONS: Final = (
+    MountSettings,
+    ClockSettings,
+    TrajectorySettings,
+    PlacingSettings,
+    AttributeSettings,
+    TrimSettings,
+    OutputSettings,
+)
 """In the order of the flight from log to products."""
-FILES: Final = ("mount", "positions", "poses", "control", "lasers", "compass")
+FILES: Final = ("mount", "positions", "poses", "control", "lasers", "compass", "area")
 """Options that name a file, looked for beside survey.yaml."""
 
 

@@ -34,6 +34,7 @@ def test_the_sample_is_the_defaults_with_a_word_about_each(tmp_path: Path) -> No
 
 OTHERS: dict[str, object] = {
     "attributes": ["sigma"],
+    "times": ["60/480"],
     "mount": {"lidar": {"position_m": [0.01, 0.02, -0.2], "pitch_deg": -30}, "gps_position_m": [0, -0.1, 0.2]},
     "crs": 3006,
     "geoid": "29.35",

@@ -16,6 +16,7 @@ from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
 from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, settings_for
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.cloud import reader
+from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED
 from groundproc.cloud.metres import metres_of
 from groundproc.raster.cells import Cells
 from groundproc.raster.grid import Grid, Window
@@ -24,8 +25,6 @@ from groundproc.raster.sampling import bilinear
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
-UNCLASSIFIED, GROUND, LOW_NOISE, HIGH_NOISE = 1, 2, 7, 18
-"""Classes of LAS 1.4 R15, table 17."""
 NOISE_HEIGHT_M: Final = 3.0
 """Lower than this above ground nothing is called high noise."""
 LEAST_DEPTH_M: Final = 0.5
