@@ -12,7 +12,6 @@ import shapely
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis import ground
-from groundproc.analysis.terrain.floor import GROUND
 from groundproc.analysis.volume import (
     AROUND_M,
     MARGIN_M,
@@ -27,6 +26,7 @@ from groundproc.analysis.volume import (
     volume,
 )
 from groundproc.cloud import reader
+from groundproc.cloud.classes import GROUND
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Window
 from groundproc.vectors.features import names_of, read_features
