@@ -5,7 +5,7 @@ taken when a message is built; the state in it may be up to a main loop older. E
 (common.xml): milliseconds or microseconds since boot.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pymavlink.dialects.v20 import ardupilotmega
 
 from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US, STANDARD_GRAVITY_M_S2
+from simulator.cameras import Exposure
 from simulator.chance import generator
 from simulator.clocks import Clock, Clocks
 from simulator.config import LinkOptions, Options
@@ -27,6 +28,9 @@ _TICK_HZ: Final = 50.0
 _GPS_HZ: Final = 5.0
 _FIX_LATE_S: Final = 0.12
 """A fix comes in this long after its epoch."""
+_FEEDBACK: Final = "camera_feedback"
+_FEEDBACK_LATE_S: Final = 0.004
+"""From an exposure to the message about it."""
 _U32: Final = 1 << 32
 _JUST_AFTER_NS: Final = 200
 SYSTEM: Final = 1
@@ -71,8 +75,11 @@ class _Moment:
 class Autopilot:
     """Builds the MAVLink stream of one simulation, stretch by stretch."""
 
-    def __init__(self, ins: Ins, clocks: Clocks, options: Options, origin: Origin, seed: int) -> None:
+    def __init__(
+        self, ins: Ins, clocks: Clocks, options: Options, origin: Origin, seed: int, noted: Sequence[Exposure] = ()
+    ) -> None:
         self._ins, self._clocks, self._origin, self._seed = ins, clocks, origin, seed
+        self._noted, self._noted_s = noted, np.array([one.time_s for one in noted])
         self._options: LinkOptions = options.link
         self._reboot, self._outage = Reboot.of(options.faults), Outage.of(options.faults)
         self._last_fix = self._fix_before_outage()
@@ -93,7 +100,7 @@ class Autopilot:
             asked |= dict.fromkeys(names, achieved_hz(rate_hz, link.firmware))
         self.rates_hz: dict[str, float] = {"heartbeat": 1.0} | {k: v for k, v in asked.items() if v > 0}
         self._builders: dict[str, Callable[[_Moment], Any]] = {
-            name: getattr(self, f"_{name}") for name in self.rates_hz
+            name: getattr(self, f"_{name}") for name in (*self.rates_hz, *([_FEEDBACK] if len(noted) else []))
         }
 
     def between(self, start_s: float, end_s: float, chunk: int) -> Iterator[Frame]:
@@ -139,6 +146,10 @@ class Autopilot:
             own = (np.arange(first, np.ceil((end_s - phase_s) * rate_hz - 1e-9)) / rate_hz) + phase_s
             times.append(own)
             names += [name] * len(own)
+        sent_s = self._noted_s + _FEEDBACK_LATE_S
+        own = sent_s[(sent_s >= start_s) & (sent_s < end_s)]
+        times.append(own)
+        names += [_FEEDBACK] * len(own)
         joined = np.concatenate(times)
         order = np.argsort(joined, kind="stable")
         return joined[order], [names[i] for i in order]
@@ -247,6 +258,19 @@ class Autopilot:
         heading = int(np.degrees(m.belief.heading_rad[m.row])) % 360
         height_m = float(m.geodetic[2][m.row])
         return ardupilotmega.MAVLink_vfr_hud_message(speed, speed, heading, 48, height_m, float(up))
+
+    def _camera_feedback(self, m: _Moment) -> Any:
+        which = int(np.argmin(np.abs(self._noted_s + _FEEDBACK_LATE_S - m.time_s)))
+        one = self._noted[which]
+        latitude, longitude, height_mm = self._place(m)
+        b, i = m.belief, m.row
+        angles = np.degrees([b.roll_rad[i], b.pitch_rad[i], b.heading_rad[i] % (2 * np.pi)])
+        stamp_us = int(self._clocks.utc.shows_ns(one.time_s)) // NS_PER_US
+        height_m = height_mm * 1e-3
+        return ardupilotmega.MAVLink_camera_feedback_message(
+            stamp_us, SYSTEM, one.camera, one.number, latitude, longitude, height_m, float(b.position_m[i, 2]),
+            *angles.tolist(), 0.0, 0,
+        )  # fmt: skip
 
     def _system_time(self, m: _Moment) -> Any:
         utc_ns = m.utc_ns if self._options.system_time == "exact" else m.epoch_ns

@@ -5,7 +5,7 @@ units and multipliers are those of AP_Logger (LogStructure.h of Copter 4.1). The
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from flightlog.clock import utc_to_gps_ns
 from flightlog.constants import NS_PER_MS, NS_PER_US
+from simulator.cameras import Exposure
 from simulator.chance import generator
 from simulator.clocks import Clocks
 from simulator.config import BoardOptions, Options
@@ -102,6 +103,9 @@ MAG: Final = Kind(
     73, "MAG", "QBhhhhhhhhhBI", "TimeUS,I,MagX,MagY,MagZ,OfsX,OfsY,OfsZ,MOX,MOY,MOZ,Health,S", "s#GGGGGGGGG-s",
     "F-CCCCCCCCC-F",
 )  # fmt: skip
+CAM: Final = Kind(
+    74, "CAM", "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y", "s#---DUmmmddd", "F----GGBBBBBB"
+)  # fmt: skip
 KINDS: Final = (FMT, UNIT, FMTU, MULT, PARM, MSG, MODE, EV, IMU, ATT, XKF1, POS, GPS, GPA, BARO, MAG)
 
 _UNITS: Final = {
@@ -115,8 +119,13 @@ _MULTIPLIERS: Final = {"-": 0.0, "?": 1.0, "0": 1.0, "B": 1e-2, "C": 1e-3, "F": 
 class BoardLog:
     """Writes the log of one simulation, stretch by stretch."""
 
-    def __init__(self, stream: BinaryIO, ins: Ins, clocks: Clocks, options: Options, origin: Origin, seed: int) -> None:
+    def __init__(
+        self, stream: BinaryIO, ins: Ins, clocks: Clocks, options: Options, origin: Origin, seed: int,
+        noted: Sequence[Exposure] = (),
+    ) -> None:  # fmt: skip
         self._stream = stream
+        self._kinds = (*KINDS, CAM) if len(noted) else KINDS
+        self._noted = noted
         self._ins, self._clocks, self._origin, self._seed = ins, clocks, origin, seed
         self._options: BoardOptions = options.board
         self._outage, self._reboot = Outage.of(options.faults), Reboot.of(options.faults)
@@ -140,7 +149,7 @@ class BoardLog:
     def _beginning(self) -> Iterator[bytes]:
         """Declarations, parameters, the firmware's name and the mode."""
         now_us = int(self._clocks.boot.shows_ns(0.0)) // NS_PER_US
-        for kind in KINDS:
+        for kind in self._kinds:
             body = struct.pack(
                 "<BB4s16s64s", kind.number, kind.dtype.itemsize, *(
                     text.encode() for text in (kind.name, kind.letters, kind.labels)
@@ -151,7 +160,7 @@ class BoardLog:
             yield UNIT.rows(1, TimeUS=now_us, Id=ord(letter), Label=unit.encode()).tobytes()
         for letter, factor in _MULTIPLIERS.items():
             yield MULT.rows(1, TimeUS=now_us, Id=ord(letter), Mult=factor).tobytes()
-        for kind in KINDS:
+        for kind in self._kinds:
             yield FMTU.rows(
                 1, TimeUS=now_us, FmtType=kind.number, UnitIds=kind.units.encode(), MultIds=kind.multipliers.encode()
             ).tobytes()
@@ -182,6 +191,24 @@ class BoardLog:
             stamp_us = self._clocks.boot.shows_ns(time_s) // NS_PER_US
             for make in makers:
                 yield make(time_s, stamp_us, belief)
+        own = [one for one in self._noted if start_s <= one.time_s < end_s]
+        if own:
+            yield self._cam(own, chunk)
+
+    def _cam(self, own: Sequence[Exposure], chunk: int) -> npt.NDArray[np.void]:
+        time_s = np.array([one.time_s for one in own])
+        b = self._ins.belief(time_s, generator(self._seed, "board log of cameras", chunk))
+        week, of_week = np.divmod(
+            [utc_to_gps_ns(t) // NS_PER_MS for t in self._clocks.utc.shows_ns(time_s).tolist()], _WEEK_MS
+        )
+        latitude, longitude, height = geodetic(b.position_m, self._origin)
+        up = b.position_m[:, 2]
+        angles = np.degrees(b.roll_rad), np.degrees(b.pitch_rad), np.degrees(b.heading_rad) % 360.0
+        return CAM.rows(
+            len(own), TimeUS=self._clocks.boot.shows_ns(time_s) // NS_PER_US, I=[one.camera for one in own],
+            Img=[one.number for one in own], GPSTime=of_week, GPSWeek=week, Lat=latitude, Lng=longitude, Alt=height, RelAlt=up,
+            GPSAlt=height, **dict(zip("RPY", angles, strict=True)),
+        )  # fmt: skip
 
     def _imu(self, time_s: Array, stamp_us: npt.NDArray[np.int64], b: Belief) -> npt.NDArray[np.void]:
         del time_s

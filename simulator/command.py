@@ -40,6 +40,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--returns", choices=("strongest", "last", "dual"), help="return mode of the lidar")
     parser.add_argument("--dark", action="store_true", help="cast no rays: quick, for tests of clocks and rates")
     parser.add_argument("--truth-points", action="store_true", help="write every true echo too (59 bytes each)")
+    parser.add_argument(
+        "--cameras",
+        metavar="RIG",
+        help="photographs too, of a named rig or a file of cameras; none: without, where a flight has some",
+    )
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="threads that cast rays (2)")
     live = parser.add_argument_group("live", "render first, then play in real time to UDP and a pseudo terminal")
     live.add_argument("--live", action="store_true", help="play what was rendered")
@@ -60,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog import config
     from flightlog.errors import UsageError
-    from simulator import plans
+    from simulator import cameras, plans
     from simulator.config import Options
     from simulator.play import Target, play
     from simulator.render import CAPTURE, TLOG, Job, render
@@ -75,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.output is None:
         raise UsageError("no folder to write to; say -o DIR")
     plan = _plan(arguments)
-    _claim(arguments)
+    _claim(arguments, plan)
     job = Job(
         plan.scene,
         plan.duration_s,
@@ -84,6 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         plan.options,
         arguments.workers,
         arguments.truth_points,
+        cameras.rig(plan.cameras) if plan.cameras else {},
     )
     quiet = not sys.stderr.isatty()
     with tqdm(total=job.duration_s, unit="s", desc="simulate", disable=quiet, bar_format=_BAR) as bar:
@@ -104,12 +110,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _claim(arguments: argparse.Namespace) -> None:
+def _claim(arguments: argparse.Namespace, plan: "Plan") -> None:
     """Refuse to write over a flight that is there, and options that would not be used."""
     from flightlog.errors import UsageError
-    from simulator.render import CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH
+    from simulator.render import FILES, IMAGES, POINTS, RTK
 
-    for name in (LOG, CAPTURE, TLOG, POSES, TRUTH, *([POINTS] if arguments.truth_points else ())):
+    more = {POINTS: arguments.truth_points, IMAGES: bool(plan.cameras), RTK: plan.options.rtk.hz > 0}
+    for name in (*FILES, *(name for name, made in more.items() if made)):
         path = arguments.output / name
         if path.exists() and not arguments.force:
             raise UsageError(f"{path}: exists already; give another name, or --force to write over it")
@@ -146,4 +153,6 @@ def _plan(arguments: argparse.Namespace) -> "Plan":
         options = dataclasses.replace(options, lidar=dataclasses.replace(options.lidar, dark=True))
     if arguments.perfect:
         options = perfect(options, arguments.perfect)
-    return dataclasses.replace(plan, scene=arguments.scene or plan.scene, duration_s=duration_s, options=options)
+    rig = plan.cameras if arguments.cameras is None else "" if arguments.cameras == "none" else arguments.cameras
+    scene = arguments.scene or plan.scene
+    return dataclasses.replace(plan, scene=scene, duration_s=duration_s, options=options, cameras=rig)

@@ -229,6 +229,15 @@ class BoardOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class RtkOptions:
+    """A second receiver whose phases are solved against a base: rtk.pos, as RTKLIB writes it."""
+
+    hz: float = option(0.0, "positions a second; 0: no such receiver", minimum=0, maximum=20)
+    sigma_m: tuple[float, float, float] = option((0.02, 0.02, 0.03), "error east, north, up, GM", minimum=0, maximum=10)
+    tau_s: float = option(10.0, "its time constant; 0: each position by itself [s]", minimum=0, maximum=1e5)
+
+
+@dataclass(frozen=True, slots=True)
 class MountOptions:
     """How the true mount differs from the nominal one that is written into the log."""
 
@@ -304,6 +313,7 @@ class Options:
     ins: InsOptions = option(InsOptions, "errors of the autopilot's estimates")
     link: LinkOptions = option(LinkOptions, "MAVLink link")
     board: BoardOptions = option(BoardOptions, "the log on the autopilot's own card")
+    rtk: RtkOptions = option(RtkOptions, "positions of centimetres")
     mount: MountOptions = option(MountOptions, "true mount against nominal")
     moving: MovingOptions = option(MovingOptions, "what moves in the scene")
     faults: FaultOptions = option(FaultOptions, "what goes wrong")

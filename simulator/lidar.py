@@ -129,7 +129,7 @@ class Lidar:
     ) -> None:
         self._traffic = traffic if traffic is not None and len(traffic) else None
         self._world, self._flight, self._options, self._seed, self._clock = world, flight, options, seed, clock
-        self._surfaces = Surfaces(world)
+        self.surfaces = Surfaces(world)
         self._lever_m, self._mat_ins_lidar = mount.lidar_position_m(), mount.mat_ins_lidar()
         self._tables = np.stack([REFLECTANCE, FALLOFF, TRANSMISSION])
         self._mode = MODES[options.returns]
@@ -210,17 +210,17 @@ class Lidar:
         flicker = np.clip(
             1.0 + self._options.intensity_noise * rng.standard_normal((len(origins) // rays, 2)), 0.05, None
         )
-        opaque, materials = self._surfaces.opaque(origins, directions), np.zeros(0, np.uint8)
+        opaque, materials = self.surfaces.opaque(origins, directions), np.zeros(0, np.uint8)
         if self._traffic is not None:
             firing, reach_m = np.nonzero(open_shots)[0], self._options.max_range_m
-            moved = self._traffic.meet(time_s, firing, origins, directions, opaque, self._surfaces.planes, reach_m)
+            moved = self._traffic.meet(time_s, firing, origins, directions, opaque, self.surfaces.planes, reach_m)
             materials = self._traffic.material[moved[1]]
         echoes = form(
             origins,
             directions,
             opaque,
-            self._surfaces.clear(origins, directions),
-            self._surfaces.planes,
+            self.surfaces.clear(origins, directions),
+            self.surfaces.planes,
             self._world.material,
             self._tables,
             rays,
@@ -322,11 +322,11 @@ class Lidar:
     def _name(self, truth: npt.NDArray[np.void], moved: _Moved) -> None:
         """Fill in normal and surface by the triangle; what moves has none, and its surface counts on from the world's."""
         planes, box = moved
-        triangles = len(self._surfaces.planes)
+        triangles = len(self.surfaces.planes)
         away = np.flatnonzero(truth["triangle"] >= triangles)
         row = truth["triangle"][away] - triangles
         truth["triangle"][away] = -1
-        truth["normal"] = self._surfaces.planes[truth["triangle"], :3]
+        truth["normal"] = self.surfaces.planes[truth["triangle"], :3]
         truth["surface"] = self._world.surface[truth["triangle"]]
         if self._traffic is not None and len(away):
             truth["normal"][away] = planes[row, :3]

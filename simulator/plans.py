@@ -23,6 +23,7 @@ class Plan:
     about: str = option("", "what the flight is for")
     scene: str = option("village", "name of the scene")
     duration_s: float = option(60.0, "seconds of flight", minimum=1, maximum=1e5)
+    cameras: str = option("", "a rig, by name or file; empty: no cameras")
     options: Options = option(Options, "instruments and motion")
 
 

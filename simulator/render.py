@@ -4,11 +4,12 @@ What is written does not depend on the number of threads.
 """
 
 import dataclasses
+import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -24,6 +25,7 @@ from flightlog.logfile import LogWriter
 from flightlog.mount import Mount
 from simulator.autopilot import Autopilot, Frame
 from simulator.boardlog import BoardLog
+from simulator.cameras import CameraOptions, built, noted
 from simulator.capture import PcapWriter, tlog_record
 from simulator.chance import generator
 from simulator.clocks import Clocks, clocks
@@ -34,13 +36,15 @@ from simulator.geodesy import Origin
 from simulator.ins import Ins
 from simulator.lidar import Lidar, Sweep
 from simulator.moving import Traffic
+from simulator.photographs import Studio
+from simulator.rtk import solution
 from simulator.scene import Scene, scene
 from simulator.telemetry import Telemetry
 from simulator.truth import COLUMNS, PointsWriter, write_json, write_poses
 
 Array = npt.NDArray[np.float64]
 
-LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH, POINTS = (
+LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH, POINTS, RTK, IMAGES = (
     "flight.mcap",
     "capture.pcap",
     "telemetry.tlog",
@@ -48,7 +52,11 @@ LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH, POINTS = (
     "truth.csv",
     "truth.json",
     "truth_points.npy",
+    "rtk.pos",
+    "images",
 )
+FILES: Final = (LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH)
+"""Of every flight."""
 _FIRINGS_IN_A_CHUNK: Final = 181 * BLOCKS
 _NETWORK_S: Final = 50e-6
 
@@ -64,6 +72,7 @@ class Job:
     options: Options
     workers: int = 2
     truth_points: bool = False
+    cameras: Mapping[str, CameraOptions] = field(default_factory=dict)
 
 
 def logged_mount(scenes: Mount, options: Options) -> Mount:
@@ -119,7 +128,12 @@ class Simulation:
             self.scene.world, self.flight, self.mount, self.clocks.lidar, options.lidar, seed, self.traffic
         )
         self.telemetry = Telemetry(self.flight, self.mount, self.clocks, options, self.origin, seed)
-        self.autopilot = Autopilot(self.ins, self.clocks, options, self.origin, seed)
+        self.studio = Studio(
+            self.scene.world, self.lidar.surfaces, self.flight, tuple(built(*item, seed) for item in job.cameras.items()),
+            self.clocks, self.origin, seed,
+        )  # fmt: skip
+        self.noted = noted(self.studio.cameras, self.studio.exposures, seed)
+        self.autopilot = Autopilot(self.ins, self.clocks, options, self.origin, seed, self.noted)
 
     @property
     def chunk_packets(self) -> int:
@@ -185,7 +199,7 @@ class Simulation:
             "local_origin": dataclasses.asdict(self.origin),
             "surfaces": [*self.scene.world.names, *self.traffic.names],
             "options": to_mapping(job.options),
-        }
+        } | ({"cameras": self.studio.truth()} if job.cameras else {})
 
     def _boresight_deg(self) -> list[float]:
         """True minus nominal yaw, pitch and roll of the lidar."""
@@ -219,7 +233,7 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
     SwathError
         The directory cannot be written.
     """
-    names = [LOG, CAPTURE, TLOG, BOARD, POSES, TRUTH] + [POINTS] * job.truth_points
+    names = [*FILES, *[POINTS] * job.truth_points, *[RTK] * (job.options.rtk.hz > 0), *[IMAGES] * bool(job.cameras)]
     parts = {name: job.directory / f"{name}.part" for name in names}
     simulation = Simulation(job)
     made = [folder for folder in (job.directory, *job.directory.parents) if not folder.exists()]
@@ -232,12 +246,17 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
                     if progress is not None:
                         start_s, end_s = simulation.bounds_s(chunk)
                         progress(end_s - start_s)
+            _write_more(simulation, parts)
             write_json(parts[TRUTH], simulation.truth())
+            if IMAGES in parts and (job.directory / IMAGES).exists():
+                shutil.rmtree(job.directory / IMAGES)
             for name, part in parts.items():
                 part.replace(job.directory / name)
             made = []
         finally:
             for part in parts.values():
+                if part.is_dir():
+                    shutil.rmtree(part)
                 part.unlink(missing_ok=True)
             with suppress(OSError):  # folders that nothing came into go again
                 for folder in made:
@@ -245,6 +264,21 @@ def render(job: Job, progress: Callable[[float], object] | None = None) -> Simul
     except OSError as error:
         raise SwathError(f"{error.filename or job.directory}: cannot be written ({error.strerror})") from None
     return simulation
+
+
+def _write_more(simulation: Simulation, parts: dict[str, Path]) -> None:
+    """What other instruments make: positions of a receiver with a base, photographs."""
+    job = simulation.job
+    if RTK in parts:
+        text = solution(
+            simulation.flight, job.options.rtk, simulation.clocks, simulation.origin, simulation.mount.gps_position_m,
+            Outage.of(job.options.faults), job.seed,
+        )  # fmt: skip
+        parts[RTK].write_text(text, encoding="utf-8")
+    if IMAGES in parts:
+        if parts[IMAGES].exists():
+            shutil.rmtree(parts[IMAGES])
+        simulation.studio.write_all(parts[IMAGES], job.workers)
 
 
 class Recording:
@@ -263,8 +297,9 @@ class Recording:
         self._tlog = self._open(parts[TLOG])
         job = simulation.job
         self._board = BoardLog(
-            self._open(parts[BOARD]), simulation.ins, simulation.clocks, job.options, simulation.origin, job.seed
-        )
+            self._open(parts[BOARD]), simulation.ins, simulation.clocks, job.options, simulation.origin, job.seed,
+            simulation.noted,
+        )  # fmt: skip
         self._poses = self._files.enter_context(parts[POSES].open("w", encoding="utf-8"))
         self._poses.write(COLUMNS + "\n")
         self._points = self._files.enter_context(PointsWriter(self._open(parts[POINTS]))) if POINTS in parts else None

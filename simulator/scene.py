@@ -68,6 +68,15 @@ def _add_reference_panels(parts: Parts) -> None:
         add_panel(parts, f"{material} upright", material, np.array([30.0 + 2.0 * i, 16.0, 0.9]), 200.0)
 
 
+def _block(north_m: float, east_m: float, heights_m: tuple[float, float]) -> tuple[tuple[float, float, float], ...]:
+    """Corners of four strips there and back, at two heights in turn."""
+    points = []
+    for strip, north in enumerate(np.linspace(-north_m, north_m, 4).tolist()):
+        ends = (-east_m, east_m) if strip % 2 == 0 else (east_m, -east_m)
+        points += [(end, north, heights_m[strip % 2]) for end in ends]
+    return tuple(points)
+
+
 def village(rng: np.random.Generator) -> Place:
     """A long house with recessed windows, garage, shed, bicycle shelter, trees, poles, wires, cars, on undulating ground."""
     parts = Parts()
@@ -110,6 +119,7 @@ def village(rng: np.random.Generator) -> Place:
     eight = eights((-15.0, 0.0), (15.0, 0.0), 12.0, (11.5, 14.0))
     mirrored = tuple((x, -y, z) for x, y, z in eight)
     both_ways = Route(points_m=((0.0, 0.0, 12.0), *eight, *mirrored), speed_m_s=6.0, smooth_s=0.7)
+    block = Route(points_m=_block(34.5, 46.0, (30.0, 33.0)), speed_m_s=5.0, loop_from=-1)
     street = [(-85.0, -20.8), (85.0, -20.8), (85.0, -18.9), (-85.0, -18.9)]
     walks = (
         [(-23.5, -10.2), (23.5, -10.2), (24.0, 9.8), (-23.5, 9.8)],
@@ -120,7 +130,7 @@ def village(rng: np.random.Generator) -> Place:
         cars=(over_ground(street, lambda x, _: np.full_like(x, -0.12)),),
         people=tuple(over_ground(walk, ground_height) for walk in walks),
     )
-    return parts.world(), {"round": route, "eights": both_ways}, tracks
+    return parts.world(), {"round": route, "eights": both_ways, "block": block}, tracks
 
 
 def field_scene(rng: np.random.Generator) -> Place:
