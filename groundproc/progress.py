@@ -4,6 +4,7 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from tqdm import tqdm
@@ -41,21 +42,28 @@ def compiling(show: Callable[[bool], None]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stages(logs: Sequence[Path], names: Mapping[str, str]) -> Iterator[Callable[[str, int], None]]:
-    """A function that is told (stage, bytes of the logs done); it shows one bar after the other, and where it waits for the compiler."""
+def stages(
+    logs: Sequence[Path], names: Mapping[str, str], counted: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[Callable[[str, int], None]]:
+    """A function that is told (stage, bytes of the logs done); it shows one bar after the other, and where it waits for the compiler.
+
+    Stages that are `counted` are told of pieces of whatever kind; how many there are is not known.
+    """
+    named = {**names, **counted}
     total = sum(path.stat().st_size for path in logs if path.is_file())
     bars: dict[str, Any] = {}
 
     def begin(stage: str, name: str) -> None:
         for bar in bars.values():
             bar.close()
+        whole, unit = (None, "") if stage in counted else (total, "B")
         bars[stage] = tqdm(
-            total=total, unit="B", unit_scale=True, desc=name, leave=False, disable=not sys.stderr.isatty()
+            total=whole, unit=unit, unit_scale=True, desc=name, leave=False, disable=not sys.stderr.isatty()
         )
 
     def advance(stage: str, done: int) -> None:
         if stage not in bars:
-            begin(stage, names[stage])
+            begin(stage, named[stage])
         bars[stage].update(done)
 
     def show(compiles: bool) -> None:

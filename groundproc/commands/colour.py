@@ -25,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-balance", action="store_true", help="take exposure and white balance of each image as they are"
     )
+    parser.add_argument(
+        "--overlays",
+        type=Path,
+        metavar="FOLDER",
+        help="write a picture of each camera there, with the points over it in colours of their height",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)
 
@@ -49,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
-    from groundproc.commands.outputs import claim_file, write_json
+    from groundproc.commands.outputs import claim_file, claim_folder, write_json
     from groundproc.commands.values import count
     from groundproc.geodesy import projected_crs
     from groundproc.imagery.painting.colour import Task, colour, sentences
@@ -58,10 +64,13 @@ def run(arguments: argparse.Namespace) -> int:
     claim_file(arguments.output, SUFFIXES, arguments.force, [arguments.cloud])
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
+    if arguments.overlays is not None:
+        there = [path.name for path in sorted(arguments.overlays.glob("*.png"))]
+        claim_folder(arguments.overlays, there, arguments.force)
     task = Task(
         arguments.cloud, arguments.images, arguments.output, arguments.photos,
         count(arguments.least_views, "--least-views"), None if arguments.crs is None else projected_crs(arguments.crs),
-        not arguments.no_balance,
+        not arguments.no_balance, arguments.overlays,
     )  # fmt: skip
     with tqdm(unit="", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

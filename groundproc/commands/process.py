@@ -58,8 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
         return _status(request, folder, arguments.json)
     until = arguments.until or ORDER[-1]
     names = {"read": "clocks and autopilot", "adjust": "trajectory", "place": "points"}
+    counted = {"images": "images adjusted", "colour": "colours", "ortho": "ortho mosaic", "ndvi": "vegetation index"}
     try:
-        with stages(request.logs, names) as progress:
+        with stages(request.logs, names, counted) as progress:
             found = process(request, folder, progress, until=until, force=arguments.force)
     except KeyboardInterrupt:
         print(f"swath: interrupted; the same command goes on after the last finished step of {folder}", file=sys.stderr)

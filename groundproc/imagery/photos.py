@@ -90,6 +90,11 @@ class Picture:
     tags: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def root(self) -> Path:
+        """The common folder that its name is below."""
+        return self.path.absolute().parents[self.name.count("/")]
+
+    @property
     def maker(self) -> tuple[str, str, int, int]:
         """Make, model and size: images that share them are of one camera."""
         return (str(self.tags.get("make", "")), str(self.tags.get("model", "")), self.width_px, self.height_px)
@@ -119,9 +124,13 @@ def files_of(given: Sequence[Path]) -> list[Path]:
 
 def names_of(files: Sequence[Path]) -> list[str]:
     """Paths of files below their common folder."""
-    absolute = [path.absolute() for path in files]
-    common = Path(os.path.commonpath([path.parent for path in absolute]))
-    return [path.relative_to(common).as_posix() for path in absolute]
+    common = common_folder(files)
+    return [path.absolute().relative_to(common).as_posix() for path in files]
+
+
+def common_folder(files: Sequence[Path]) -> Path:
+    """The deepest folder that all files are in or below."""
+    return Path(os.path.commonpath([path.absolute().parent for path in files]))
 
 
 def look(files: Sequence[Path]) -> Iterator[Picture | tuple[str, str]]:

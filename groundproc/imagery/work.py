@@ -177,6 +177,8 @@ def _finish(
     session.warnings += _doubts(told, session, measured)
     told["left_out"] = session.left_out
     told["warnings"] = session.warnings
+    if session.pictures:
+        told["images_folder"] = str(session.pictures[0].root)
     poses = results.map_poses(adjusted, session.site, utc_ns)
     results.write_all(task.output, adjusted, session.site, poses, measured.names, told)
     if session.trajectory is not None:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.raster import geotiff
-from groundproc.reporting import cloudpart, maps, words
+from groundproc.reporting import cloudpart, imagepart, maps, words
 from groundproc.reporting.charts import charts
 from groundproc.reporting.cloudpart import CloudPart
 from groundproc.reporting.markup import Html, joined, section, tag
@@ -96,6 +96,7 @@ def _after(subject: Subject, part: CloudPart | None) -> Html:
     return joined(
         [
             _maps(subject, part),
+            imagepart.images(quality, subject.folder, list(subject.digests)),
             section("quality", "Quality over time", curves),
             words.clocks(quality),
             words.control(quality),
@@ -125,7 +126,7 @@ def _cloud(subject: Subject, part: CloudPart | None, text: str) -> Html:
 
 
 def _maps(subject: Subject, part: CloudPart | None) -> Html:
-    layers, shade = maps.layers_of(subject.folder, list(subject.digests))
+    layers, shade = maps.layers_of(subject.folder, [name for name in subject.digests if name not in imagepart.MOSAICS])
     if not layers and part is not None:
         layers = [maps.of_points(part.points.xyz_m)]
     if not layers:

@@ -4,10 +4,13 @@ Each step is a file that says what it reads, which settings it looks at, and wha
 ledger of the output folder (`ledger.Ledger`), so that a second run does only what changed, and an interrupted one goes on.
 
 log --clocks--> one time scale --trajectory--> estimate --place--> points and products --quality--> quality.json
+photographs, estimate, points --images--> poses of images --colour, ortho, ndvi--> coloured cloud, mosaics
 estimate, quality.json --products--> pictures and tables
 """
 
 from typing import Final
 
-ORDER: Final = ("clocks", "trajectory", "place", "quality", "products")
+ORDER: Final = ("clocks", "trajectory", "place", "images", "colour", "ortho", "ndvi", "quality", "products")
 """The steps, each a module of this package with a `STEP`."""
+OF_IMAGES: Final = ("images", "colour", "ortho", "ndvi")
+"""Those that have something to do only where there are photographs."""

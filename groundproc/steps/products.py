@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from groundproc.products import chosen, plain
 from groundproc.products.product import Context, draw
+from groundproc.steps import OF_IMAGES
 from groundproc.steps.ledger import INSIDE, open_ledger
 from groundproc.steps.place import projection_of
 from groundproc.steps.request import Request
@@ -57,7 +58,7 @@ def digests_of(folder: Path) -> dict[str, str]:
 STEP: Final = Step(
     name="products",
     about="pictures and tables of what the other steps found",
-    after=("trajectory", "place", "quality"),
+    after=("trajectory", "place", *OF_IMAGES, "quality"),
     reads_logs=False,
     settings=settings,
     work=work,

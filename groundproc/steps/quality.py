@@ -9,7 +9,8 @@ import numpy as np
 from flightlog import FORMAT_VERSION, __version__, config
 from flightlog.clock import utc_text
 from groundproc.estimation import ins
-from groundproc.steps import clocks, place
+from groundproc.steps import OF_IMAGES, clocks, place
+from groundproc.steps.photographs import found_in
 from groundproc.steps.request import Request, absolute
 from groundproc.steps.run import Run
 from groundproc.steps.step import WHOLE, Folders, Step
@@ -29,6 +30,8 @@ def work(run: Run, folders: Folders) -> None:
     tied = json.loads((run.folder / clocks.FOUND).read_text(encoding="utf-8"))
     placed = json.loads((run.folder / place.FOUND).read_text(encoding="utf-8"))
     quality = describe(run.survey, run.estimate, tied, placed)
+    if run.survey.images is not None:
+        quality["images"] = found_in(run.folder)
     # first, where a reader of the file looks
     quality = judge_flight(quality).to_mapping() | quality
     (folders[WHOLE] / "quality.json").write_text(json.dumps(quality, indent=2) + "\n", encoding="utf-8")
@@ -91,7 +94,7 @@ def describe_mount(made: Estimate) -> dict[str, Any]:
 STEP: Final = Step(
     name="quality",
     about="figures about the flight and the products",
-    after=("clocks", "trajectory", "place"),
+    after=("clocks", "trajectory", "place", *OF_IMAGES),
     reads_logs=False,
     settings=settings,
     work=work,

@@ -207,6 +207,56 @@ class TrimSettings:
 
 
 @dataclass(frozen=True)
+class ImageSettings:
+    """Images: photographs of the flight, which give the cloud colours, an ortho mosaic and a vegetation index."""
+
+    images: str | None = setting(
+        None,
+        "photographs of the flight: a folder, looked through with all below it",
+        words=("--images",),
+        metavar="DIR",
+        reads="file",
+        absent="none",
+        in_file="a folder looked for beside this file",
+    )
+    rig: str | None = setting(
+        None,
+        "cameras and how they sit on the aircraft: rig.yaml (Kalibr), cameras.txt (COLMAP) or camera_models.json (OpenSfM)",
+        words=("--rig",),
+        metavar="FILE",
+        reads="file",
+        absent="as the photographs state",
+        in_file=BESIDE,
+    )
+    image_times: str | None = setting(
+        None,
+        "which image when: .MRK, or a CSV with image,utc_ns",
+        words=("--image-times",),
+        metavar="FILE",
+        reads="file",
+        absent="as the photographs state",
+        in_file=BESIDE,
+    )
+    panels: str | None = setting(
+        None,
+        "surfaces of known reflectance, for the vegetation index: CSV with name,x,y,z,radius,red,green,blue,nir",
+        words=("--panels",),
+        metavar="CSV",
+        reads="file",
+        absent="none, and the index is said not to be calibrated",
+        in_file=BESIDE,
+    )
+    ortho_gsd_m: float = setting(
+        0.05,
+        "size of a pixel of ortho.tif and ndvi.tif [m]",
+        words=("--ortho-gsd-m",),
+        metavar="M",
+        minimum=0.001,
+        maximum=100,
+    )
+
+
+@dataclass(frozen=True)
 class OutputSettings:
     """Output: which products, and their coordinates and heights."""
 
@@ -242,7 +292,14 @@ class OutputSettings:
 
 @dataclass(frozen=True)
 class Survey(
-    OutputSettings, TrimSettings, AttributeSettings, PlacingSettings, TrajectorySettings, ClockSettings, MountSettings
+    OutputSettings,
+    ImageSettings,
+    TrimSettings,
+    AttributeSettings,
+    PlacingSettings,
+    TrajectorySettings,
+    ClockSettings,
+    MountSettings,
 ):
     """All that can be chosen: the options of `swath process`."""
 
@@ -254,11 +311,14 @@ SECTIONS: Final = (
     PlacingSettings,
     AttributeSettings,
     TrimSettings,
+    ImageSettings,
     OutputSettings,
 )
 """In the order of the flight from log to products."""
-FILES: Final = ("mount", "positions", "poses", "control", "lasers", "compass", "area")
-"""Options that name a file, looked for beside survey.yaml."""
+FILES: Final = (
+    "mount", "positions", "poses", "control", "lasers", "compass", "area", "images", "rig", "image_times", "panels"
+)  # fmt: skip
+"""Options that name a file or a folder, looked for beside survey.yaml."""
 
 
 def section(survey: Survey, *chosen: type[Any]) -> dict[str, Any]:

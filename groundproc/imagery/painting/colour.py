@@ -4,7 +4,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +16,18 @@ from groundproc.cloud.dimensions import TABLE, dimension
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.imagery.painting.balance import gains
-from groundproc.imagery.painting.block import Block, Layer, load
+from groundproc.imagery.painting.block import COLOURS, Block, Layer, load
+from groundproc.imagery.painting.overlay import overlays
 from groundproc.imagery.painting.paint import paint, part, room
 from groundproc.imagery.painting.scene import Scene, mapped
-from groundproc.imagery.painting.views import NOBODY, Views, blend
+from groundproc.imagery.painting.score import Score, score, worst
+from groundproc.imagery.painting.views import Views, blend
 
 Progress = Callable[[str, int], object]
 Array = npt.NDArray[np.float64]
 
 VIEWS: Final = "views"
 TEMPERATURE: Final = "temperature"
-_HELD_OUT: Final = 50_000
-"""Points that the score is made of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,8 @@ class Task:
         Of the cloud, where it does not say.
     balance : bool
         Bring the images to one exposure.
+    overlays : Path, optional
+        Folder for a picture of each camera with the points over it.
     """
 
     cloud: Path
@@ -57,6 +59,7 @@ class Task:
     least: int = 1
     crs: pyproj.CRS | None = None
     balance: bool = True
+    overlays: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +72,15 @@ class Made:
     images : int
     bands : tuple of str
     held_out : mapping of str to float
-        How far, rms, what the other views of a point say is from what each view shows [percent of the full scale], by band.
+        How far, rms, what the other images say of the points of each is from what it shows [percent of the full scale], by band.
+    held_out_images : mapping of str to float
+        The same of each image, over its bands.
     left_out : tuple of str
         Images that could not be used, and why.
     views : float
         Views of a coloured point, mean.
+    overlays : tuple of str
+        Pictures with the points over them.
     """
 
     points: int
@@ -81,8 +88,10 @@ class Made:
     images: int
     bands: tuple[str, ...]
     held_out: Mapping[str, float]
+    held_out_images: Mapping[str, float]
     left_out: tuple[str, ...]
     views: float
+    overlays: tuple[str, ...] = ()
 
     def figures(self) -> dict[str, Any]:
         """For programs."""
@@ -98,62 +107,83 @@ def colour(task: Task, progress: Progress) -> Made:
     """
     cloud = reader.look(task.cloud)
     block = load(task.images, task.photos, task.crs or cloud.horizontal, task.cloud)
-    _check_bands(block)
+    layers, unused = _layers(block)
     with tempfile.TemporaryDirectory(prefix=".swath-colour-", dir=_beside(task.output)) as scratch:
         folder = Path(scratch)
         scene = Scene(cloud, block.site, folder, lambda n: progress("reading", n))
-        columns: dict[str, npt.NDArray[Any]] = {}
-        held_out: dict[str, float] = {}
-        failed: tuple[str, ...] = ()
         seen = mapped(folder / "seen", np.uint8, (cloud.points,))
-        for number, layer in enumerate(block.layers):
-            place = folder / str(number)
-            place.mkdir()
-            views = room(cloud.points, layer, place)
-            failed += paint(block, layer, scene, views, lambda n: progress("images", n))
-            factor = gains(
-                views, len(layer.images), layer.full, measured=not task.balance or TEMPERATURE in layer.bands
-            )
-            columns |= _columns(block, layer, scene, views, factor, task.least, place)
-            held_out |= _held_out(layer, views, factor)
-            if number == 0 or set(layer.bands) & {"red", "green", "blue"}:
-                for square in scene.squares:
-                    numbers = scene.number[square.points]
-                    seen[numbers] = np.maximum(seen[numbers], views.total[square.points])
+        laid = [_laid(task, block, layer, scene, folder / str(number), progress) for number, layer in enumerate(layers)]
+        columns: dict[str, npt.NDArray[Any]] = {}
+        for number, (layer, one) in enumerate(zip(layers, laid, strict=True)):
+            columns |= {band: column for band, column in one.columns.items() if band not in columns}
+            if number == 0 or set(layer.bands) & set(COLOURS):
+                np.maximum(seen, one.total, out=seen)
         if task.least > 1:
             seen[seen < task.least] = 0
+        drawn = () if task.overlays is None else overlays(task.overlays, block, layers, [o.seen for o in laid], scene)
         _write(task, cloud, columns | {VIEWS: seen}, progress)
         coloured = int(np.count_nonzero(seen))
-        total = float(seen.sum(dtype=np.int64) / coloured) if coloured else 0.0
-    images = sum(len(layer.images) for layer in block.layers) - len(failed)
-    bands = tuple(dict.fromkeys(band for layer in block.layers for band in layer.bands))
-    return Made(cloud.points, coloured, images, bands, held_out, (*block.left_out, *failed), total)
+        views = float(seen.sum(dtype=np.int64) / coloured) if coloured else 0.0
+    failed = tuple(sentence for one in laid for sentence in one.failed)
+    images = sum(len(layer.images) for layer in layers) - len(failed)
+    by_band = {band: value for one in reversed(laid) for band, value in one.score.bands.items()}
+    by_image = {name: value for one in laid for name, value in one.score.images.items()}
+    left_out = (*block.left_out, *unused, *failed)
+    return Made(cloud.points, coloured, images, tuple(columns), by_band, by_image, left_out, views, drawn)
+
+
+class _Laid(NamedTuple):
+    """A layer laid over the cloud: attributes and views of all points in the order of the file, points that each image sees."""
+
+    columns: dict[str, npt.NDArray[Any]]
+    total: npt.NDArray[np.uint8]
+    seen: npt.NDArray[np.int64]
+    score: Score
+    failed: tuple[str, ...]
+
+
+def _laid(task: Task, block: Block, layer: Layer, scene: Scene, place: Path, progress: Progress) -> _Laid:
+    """Lay a layer over the cloud; arrays lie in a folder."""
+    place.mkdir()
+    views = room(scene.size, layer, place)
+    painted = paint(block, layer, scene, views, lambda n: progress("images", n))
+    measured = not task.balance or TEMPERATURE in layer.bands
+    factor = gains(views, len(layer.images), layer.full, measured)
+    total = mapped(place / "seen", np.uint8, (scene.size,))
+    for square in scene.squares:
+        total[scene.number[square.points]] = views.total[square.points]
+    columns = _columns(block, layer, scene, views, factor, task.least, place)
+    return _Laid(columns, total, painted.seen, score(layer, views, factor), painted.failed)
+
+
+def _layers(block: Block) -> tuple[list[Layer], tuple[str, ...]]:
+    """The layers that give attributes, colours first, and a sentence about each that gives none that another does not.
+
+    Raises
+    ------
+    UsageError
+        A band is called by no name of an attribute.
+    """
+    names = {entry.name for entry in TABLE}
+    strange = next((band for layer in block.layers for band in layer.bands if band not in names), None)
+    if strange is not None:
+        raise UsageError(
+            f"rig: band {strange!r}: expected a name of a point attribute: red, green, blue, nir, red_edge or temperature"
+        )
+    chosen, unused, given = [], [], set[str]()
+    for layer in sorted(block.layers, key=lambda each: (not set(COLOURS) <= set(each.bands), -len(each.images))):
+        if set(layer.bands) <= given:
+            count = f"{len(layer.images)} images such as {layer.images[0].name}"
+            unused.append(f"{count} are not used: other pictures give {', '.join(layer.bands)} already")
+        else:
+            chosen.append(layer)
+            given |= set(layer.bands)
+    return chosen, tuple(unused)
 
 
 def _beside(output: Path) -> Path:
     """The nearest folder above the output that is there."""
     return next(folder for folder in output.resolve().parents if folder.is_dir())
-
-
-def _check_bands(block: Block) -> None:
-    """Refuse bands that no attribute of points is called by, and layers that give one band twice.
-
-    Raises
-    ------
-    UsageError
-    """
-    names = {entry.name for entry in TABLE}
-    for layer in block.layers:
-        for band in layer.bands:
-            if band not in names:
-                raise UsageError(
-                    f"rig: band {band!r}: expected a name of a point attribute: red, green, blue, nir, red_edge or temperature"
-                )
-    kinds = [layer.bands for layer in block.layers]
-    twice = {band for bands in set(kinds) for band in bands if sum(band in other for other in set(kinds)) > 1}
-    if twice or len(kinds) != len(set(kinds)):
-        band = min(twice) if twice else kinds[0][0]
-        raise UsageError(f"rig: band {band!r} comes of two kinds of pictures; expected one: choose cameras by the rig")
 
 
 def _columns(
@@ -194,21 +224,6 @@ def response_of(response: Any) -> tuple[float, float]:
         raise UsageError(f"rig: response: {response!r} found, expected {{scale: S, offset: O}}") from None
 
 
-def _held_out(layer: Layer, views: Views, factor: npt.NDArray[np.float32]) -> dict[str, float]:
-    """For each band, how well the others of its views tell what a view shows."""
-    several = np.flatnonzero(views.total >= 2)
-    if not len(several):
-        return {}
-    several = several[:: max(1, len(several) // _HELD_OUT)]
-    image, value = views.image[several], np.asarray(views.value[several], np.float64)
-    there = image != NOBODY
-    balanced = value * np.where(there[..., None], factor[np.where(there, image, 0)], 0.0)
-    others = there.sum(axis=1) - 1
-    told = (balanced.sum(axis=1, keepdims=True) - balanced) / np.maximum(others, 1)[:, None, None]
-    off = np.where(there[..., None], told - balanced, np.nan) / layer.full * 100.0
-    return {band: float(np.sqrt(np.nanmean(off[:, :, plane] ** 2))) for plane, band in enumerate(layer.bands)}
-
-
 def _write(task: Task, cloud: reader.Cloud, columns: Mapping[str, npt.NDArray[Any]], progress: Progress) -> None:
     """The cloud with its colours."""
     compressed = task.output.suffix.lower() == ".laz"
@@ -229,8 +244,14 @@ def _write(task: Task, cloud: reader.Cloud, columns: Mapping[str, npt.NDArray[An
 def sentences(made: Made) -> Sequence[str]:
     """For people."""
     share = made.coloured / made.points
-    score = ", ".join(f"{band} {value:.1f} %" for band, value in made.held_out.items())
+    by_band = ", ".join(f"{band} {value:.1f} %" for band, value in made.held_out.items())
+    name = worst(made.held_out_images)
+    most = f"; most in {name}, {made.held_out_images[name]:.1f} %" if name else ""
     return [
         f"{made.coloured:,} of {made.points:,} points ({share:.1%}) are seen by {made.images} images, {made.views:.1f} each",
-        *([f"held-out views differ by {score} of the full scale, rms"] if score else []),
+        *(
+            [f"held out, an image differs from what the others say by {by_band} of the full scale, rms{most}"]
+            if by_band
+            else []
+        ),
     ]

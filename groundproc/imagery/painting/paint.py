@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,21 @@ Load = Callable[[Image], npt.NDArray[Any]]
 _THREADS: Final = 2
 _EDGE: Final = 0.5
 """Weight at the corner of a picture, of that in its middle: lenses are worst there."""
+
+
+class Painted(NamedTuple):
+    """What came of it.
+
+    Attributes
+    ----------
+    seen : ndarray of int64, shape (images,)
+        Points that each image sees.
+    failed : tuple of str
+        What became of images that could not be read.
+    """
+
+    seen: npt.NDArray[np.int64]
+    failed: tuple[str, ...]
 
 
 def plain(image: Image) -> npt.NDArray[Any]:
@@ -52,8 +67,8 @@ def part(views: Views, points: slice) -> Views:
 
 def paint(
     block: Block, layer: Layer, scene: Scene, views: Views, progress: Callable[[int], object], load: Load = plain
-) -> tuple[str, ...]:
-    """Lay all images of a layer over the points of a scene; gives what became of those that could not be read.
+) -> Painted:
+    """Lay all images of a layer over the points of a scene.
 
     Parameters
     ----------
@@ -68,23 +83,25 @@ def paint(
     """
     locks = {id(square): threading.Lock() for square in scene.squares}
 
-    def one(number: int) -> str:
-        image = layer.images[number]
+    def one(number: int) -> tuple[int, str]:
+        image, count = layer.images[number], 0
         try:
             shown = load(image)
         except CaptureError as error:
-            return str(error)
+            return 0, str(error)
         for square, seen, weight in visible(block, image, scene):
+            count += len(seen.number)
             with locks[id(square)]:
                 best.insert(part(views, square.points), shown, seen, weight, number)
         progress(1)
-        return ""
+        return count, ""
 
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(_THREADS))
         running = [pool.submit(one, number) for number in range(len(layer.images))]
         stack.callback(lambda: [each.cancel() for each in running])
-        return tuple(sentence for each in running if (sentence := each.result()))
+        counts, sentences = zip(*(each.result() for each in running), strict=True)
+        return Painted(np.array(counts, np.int64), tuple(filter(None, sentences)))
 
 
 def visible(block: Block, image: Image, scene: Scene) -> Iterator[tuple[Square, Seen, npt.NDArray[np.float32]]]:

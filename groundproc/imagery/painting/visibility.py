@@ -118,11 +118,19 @@ class Depths:
         self._scale = min(1.0, _FINE / max(apart_px, 1e-6))
         self._focal = focal_px * self._scale
         width, height = (int(np.ceil(side * self._scale)) + 1 for side in eye.size_px)
-        self._nearest = np.full((height, width), np.inf, np.float32)
+        self.nearest = np.full((height, width), np.inf, np.float32)
+        """Distance to the nearest point for each of its pixels [m]; infinite where there is none."""
+
+    def at(self, pixel: Array) -> npt.NDArray[np.float32]:
+        """The distance to the nearest point at pixels of the picture, shape (n, 2)."""
+        row, column = ((pixel[:, axis] + 0.5) * self._scale for axis in (1, 0))
+        height, width = self.nearest.shape
+        places = np.clip(row, 0, height - 1).astype(np.intp), np.clip(column, 0, width - 1).astype(np.intp)
+        return np.asarray(self.nearest[places])
 
     def add(self, seen: Seen, spacing_m: npt.NDArray[np.float32]) -> None:
         """Take points, with the distances to their neighbours, shape (k,)."""
-        _splat(seen.pixel, seen.range_m, spacing_m, self._focal, self._scale, self._nearest)
+        _splat(seen.pixel, seen.range_m, spacing_m, self._focal, self._scale, self.nearest)
 
     def sees(self, seen: Seen, surface: Surface, place_m: Array) -> npt.NDArray[np.bool_]:
         """Which of some points nothing hides, shape (k,).
@@ -136,7 +144,7 @@ class Depths:
             Projection centre in the frame of their coordinates.
         """
         out = np.empty(len(seen.number), np.bool_)
-        _sees(seen, surface, place_m, (self._scale, self._focal), self._nearest, out)
+        _sees(seen, surface, place_m, (self._scale, self._focal), self.nearest, out)
         return out
 
 
