@@ -22,8 +22,8 @@ def files(request: Request) -> Mapping[str, Path]:
 
 
 def settings(request: Request) -> Mapping[str, Any]:
-    """Files alone."""
-    return {"rig": request.survey.rig, "image_times": request.survey.image_times}
+    """Files, which count by their content; that of the folder is in the pictures."""
+    return {"images": None, "rig": request.survey.rig, "image_times": request.survey.image_times}
 
 
 def work(run: Run, folders: Folders) -> None:

@@ -86,7 +86,9 @@ def instants(images: Sequence[Image], utc_ns: Sequence[int], within_s: float) ->
 
     def close() -> None:
         if len(group) > 1:
-            found.append(Instant(tuple(images[n] for n in group), round(np.mean([utc_ns[n] - utc_ns[group[0]] for n in group])) + utc_ns[group[0]]))  # fmt: skip
+            first_ns = utc_ns[group[0]]
+            mean_ns = first_ns + round(sum(utc_ns[n] - first_ns for n in group) / len(group))
+            found.append(Instant(tuple(images[n] for n in group), mean_ns))
         group.clear()
 
     for number in order:
