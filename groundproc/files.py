@@ -40,6 +40,15 @@ def written_aside(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
+def removed(path: Path) -> Iterator[Path]:
+    """A file that is there for the time of the work."""
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
     """Make a folder for what is written inside; one that was not there before goes again if nothing came of it.
 

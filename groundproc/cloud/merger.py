@@ -12,7 +12,7 @@ import numpy.typing as npt
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from flightlog.errors import CaptureError, SourceError
-from groundproc.cloud.dimensions import in_order
+from groundproc.cloud.dimensions import TABLE, in_order
 from groundproc.cloud.packer import extra_bytes
 from groundproc.cloud.reader import Cloud, opened
 from groundproc.cloud.storing import storing
@@ -21,7 +21,10 @@ _INT32: Final = np.iinfo(np.int32)
 
 
 class Merger:
-    """Writes one LAZ file, LAS 1.4, point format 6 to 8. Extra bytes of all clouds are kept; where one lacks them they are 0.
+    """Writes one LAZ file, LAS 1.4, point format 6 to 8.
+
+    Extra bytes of all clouds are kept. Where one lacks them they are not known: not a number, or what stands for no data where the table
+    has them, else 0.
 
     Use as a context manager; the caller writes aside.
 
@@ -35,6 +38,8 @@ class Merger:
 
     Raises
     ------
+    CaptureError
+        Extra bytes of one name are of different types or steps.
     SourceError
         The file cannot be written.
     """
@@ -44,6 +49,7 @@ class Merger:
         names: set[str] = set()
         scales, offsets, standard = [], [], False
         extra: dict[str, Any] = {}
+        own = {entry.name for entry in self._added}
         for cloud in clouds:
             with opened(cloud.path) as reader:
                 header = reader.header
@@ -52,13 +58,16 @@ class Merger:
                 offsets.append(header.offsets)
                 standard |= cloud.timed and not cloud.week_time
                 for each in header.point_format.extra_dimensions:
-                    extra.setdefault(each.name, each)
+                    if each.name not in own:
+                        _one_meaning(extra.setdefault(each.name, each), each, cloud.path)
         wanted = 8 if "nir" in names else 7 if "red" in names else 6
         self._format = laspy.PointFormat(wanted)
-        own = {entry.name for entry in self._added}
-        self._format.dimensions.extend(each for name, each in extra.items() if name not in own)
+        self._format.dimensions.extend(extra.values())
         for entry in self._added:
-            self._format.add_extra_dimension(extra_bytes(entry))
+            if not entry.field:
+                self._format.add_extra_dimension(extra_bytes(entry))
+        self._unknown = {name: value for name in extra if (value := _unknown(name, extra[name].dtype)) is not None}
+        self._records: Sequence[laspy.VLR] = ()
         header = laspy.LasHeader(version="1.4", point_format=self._format)
         header.scales, header.offsets = np.min(scales, axis=0), np.asarray(offsets[0])
         header.global_encoding.gps_time_type = (
@@ -87,7 +96,13 @@ class Merger:
                 self._las.dest.close()
             return
         with storing(self._path):
+            if self._records:
+                self._las.write_evlrs(laspy.vlrs.vlrlist.VLRList(self._records))
             self._las.close()
+
+    def close_with(self, records: Sequence[laspy.VLR]) -> None:
+        """What is to stand behind the points when all is written."""
+        self._records = records
 
     def write(
         self, record: Any, columns: Mapping[str, npt.NDArray[Any]], xyz_m: npt.NDArray[np.float64] | None = None
@@ -102,7 +117,7 @@ class Merger:
         out = laspy.ScaleAwarePointRecord.zeros(
             len(record), point_format=self._format, scales=self._scales, offsets=self._offsets
         )
-        own = {entry.name for entry in self._added}
+        own = {entry.field or entry.name for entry in self._added}
         known = set(self._format.dimension_names)
         for name in record.point_format.dimension_names:
             if name == "scan_angle_rank":
@@ -120,6 +135,30 @@ class Merger:
                 raise CaptureError(f"{self._path}: a point lies too far from the first cloud to be in one file with it")
             out[name] = stored.astype(np.int32)
         for entry in self._added:
-            out[entry.name] = np.asarray(columns[entry.name]).astype(entry.stored)
+            out[entry.field or entry.name] = np.asarray(columns[entry.name]).astype(entry.stored)
+        for name, value in self._unknown.items():
+            if name not in record.point_format.dimension_names:
+                out.array[name] = value
         with storing(self._path):
             self._las.write_points(out)
+
+
+def _one_meaning(one: Any, other: Any, path: Path) -> None:
+    """Refuse extra bytes of one name that are not stored alike."""
+    told = [
+        (each.dtype, *(None if v is None else tuple(np.atleast_1d(v)) for v in (each.scales, each.offsets)))
+        for each in (one, other)
+    ]
+    if told[0] != told[1]:
+        raise CaptureError(
+            f"{path}: its attribute {other.name} is stored as {told[1][0]} with step {told[1][1]}, in a cloud before as {told[0][0]} with "
+            f"step {told[0][1]}; expected one meaning of one name"
+        )
+
+
+def _unknown(name: str, dtype: np.dtype[Any]) -> float | int | None:
+    """What is stored where a cloud does not have an attribute; None: 0, as there is nothing that says so."""
+    entry = next((each for each in TABLE if each.name == name and not each.field), None)
+    if entry is not None and entry.no_data is not None:
+        return entry.no_data
+    return float("nan") if dtype.kind == "f" else None

@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -81,7 +81,7 @@ def _cloud(arguments: argparse.Namespace) -> int:
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.commands.selecting import asked, choices_of
-    from groundproc.files import written_aside
+    from groundproc.files import removed, written_aside
 
     output = arguments.output
     expect([arguments.source], CLOUD, CLOUD_WORDS)
@@ -97,22 +97,13 @@ def _cloud(arguments: argparse.Namespace) -> int:
         if asked(arguments):
             clock = Clock(week=arguments.week)
             cloud = replace(cloud, choices=tuple(choices_of(arguments, cloud, clock, bar.update)))
-            part = stack.enter_context(_removed(aside.with_name(f"{aside.name}.laz")))
+            part = stack.enter_context(removed(aside.with_name(f"{aside.name}.laz")))
             left_out = write_part(cloud, part, clock if arguments.times is not None else None, bar.update)
             cloud = reader.look(part)
         exports.write(cloud, output, aside, bar.update)
     told = ", ".join(f"{count:,} by {name}" for name, count in left_out.items())
     print(f"{cloud.points:,} points in {output}" + (f"; left out: {told}" if told else ""))
     return 0
-
-
-@contextlib.contextmanager
-def _removed(path: Path) -> Iterator[Path]:
-    """A file for the time of the work."""
-    try:
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
 
 
 def _trajectory(arguments: argparse.Namespace) -> int:

@@ -50,6 +50,26 @@ def expect(paths: Iterable[Path | str | None], kinds: Iterable[str], expected: s
             raise CaptureError(f"{path}: {kind.sentence(path)}{inside(path)}; expected {expected}")
 
 
+def cloud_in(path: Path) -> Path:
+    """A cloud, or that of a folder of products.
+
+    Raises
+    ------
+    CaptureError
+        The folder holds none.
+    """
+    from flightlog.errors import CaptureError
+
+    if not path.is_dir():
+        return path
+    for name in ("cloud.laz", "cloud.copc.laz"):
+        if (path / name).is_file():
+            return path / name
+    raise CaptureError(
+        f"{path}: a folder without cloud.laz or cloud.copc.laz{inside(path)}; expected {CLOUD_WORDS} or a folder of products"
+    )
+
+
 def expect_text(path: Path | str | None, expected: str) -> None:
     """Refuse what is known to be no text of keys and values; one that is not there, its reader names.
 

@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 import pyproj
 
-from flightlog.errors import GeodesyError, UsageError
+from flightlog.errors import UsageError
 from groundproc import geodesy
 from groundproc.cloud import reader
+from groundproc.cloud.sameness import agreed_crs
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Window
@@ -91,19 +92,10 @@ def common_crs(clouds: Sequence[reader.Cloud], code: str | None) -> tuple[pyproj
     """
     if code is not None:
         return geodesy.projected_crs(code), ()
-    first = clouds[0]
-    for other in clouds[1:]:
-        if other.crs != first.crs:
-            raise GeodesyError(
-                f"{other.path}: is in {_named(other.crs)}, but {first.path} in {_named(first.crs)}; expected one CRS"
-            )
-    if first.crs is None:
-        return None, (f"{first.path} states no CRS, and so the raster states none; --crs EPSG says which it is",)
-    return first.crs, ()
-
-
-def _named(crs: pyproj.CRS | None) -> str:
-    return "no CRS" if crs is None else str(crs.name)
+    crs = agreed_crs(clouds)
+    if crs is None:
+        return None, (f"{clouds[0].path} states no CRS, and so the raster states none; --crs EPSG says which it is",)
+    return crs, ()
 
 
 def _of_heights(task: Task, chosen: Kind) -> Made:

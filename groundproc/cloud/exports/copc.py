@@ -13,6 +13,8 @@ from groundproc.cloud.reader import Cloud, chunks, opened
 _NEWER: Final = {0: 6, 1: 6, 2: 7, 3: 7, 4: 6, 5: 7, 6: 6, 7: 7, 8: 8, 9: 6, 10: 8}
 """Point formats that COPC allows for those that there are; waveforms are left out."""
 _NOT_KEPT: Final = ("copc", "laszip encoded")
+_LONGEST: Final = 65535
+"""Bytes of a record in front of the points."""
 _EXTRA_BYTES, _GEOTIFF = 4, (34735, 34736, 34737)
 
 
@@ -48,10 +50,18 @@ def _header(cloud: Cloud) -> laspy.LasHeader:
         header.creation_date = old.creation_date
         header.global_encoding = old.global_encoding
         header.vlrs.extend(each for each in old.vlrs if _kept(each))
+        if old.version.minor >= 4:
+            reader.read_evlrs()
+            header.vlrs.extend(each for each in reader.evlrs or () if _kept(each) and _short(each))
     header.global_encoding.wkt = True
     if cloud.crs is not None and not any(vlr.record_id == 2112 for vlr in header.vlrs):
         header.add_crs(cloud.crs)
     return header
+
+
+def _short(record: Any) -> bool:
+    """Whether a record from behind the points has room in front of them; behind them COPC has the octree alone."""
+    return len(record.record_data_bytes()) <= _LONGEST
 
 
 def _kept(vlr: Any) -> bool:
