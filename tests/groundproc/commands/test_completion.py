@@ -26,7 +26,7 @@ def completed(script: str, *words: str) -> set[str]:
 @pytest.mark.parametrize("script", ["bash"], indirect=True)
 def test_bash_completes_commands_options_and_their_values(script: str, tmp_path: Path) -> None:
     assert completed(script, "") >= set(commands())
-    assert completed(script, "pro") == {"process"}
+    assert completed(script, "pro") == {"process", "profile"}
     assert completed(script, "process", "--he") == {"--help", "--height"}
     assert completed(script, "process", "x.mcap", "--height", "") == {"msl", "ellipsoid", "relative"}
     assert completed(script, "process", "--until", "pl") == {"place"}
