@@ -6,6 +6,7 @@
 #   make soak        the long tests: hour-long logs, many seeds
 #   make bench-NAME  one benchmark of benchmarks/; its last line is one JSON object
 #   make bench       all of them, into docs/benchmarks.md, but the longest: `benchmarks/all.py --only kit study windows`
+#   make docs        the pages as a site, site/index.html; warnings are errors
 #   make deb         dist/swathd_VERSION_{amd64,arm64}.deb, for the payload computer
 #   make release     dist/VERSION/: wheel, sdist, the packages, notes, SBOM and checksums; publishes nothing
 #   make clean       everything made, the environment included
@@ -20,7 +21,7 @@ PYTEST := $(BIN)/pytest
 # A file of tests stays on one worker, so that what its fixtures made is made once.
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: setup demo test check soak bench deb release clean
+.PHONY: setup demo test check soak bench docs deb release clean
 
 setup: $(VENV)/.installed
 
@@ -81,6 +82,9 @@ soak: setup
 bench-%: setup
 	@$(BIN)/python benchmarks/$*.py
 
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
 deb: setup
 	$(BIN)/python package/deb.py
 
@@ -91,5 +95,5 @@ bench: setup
 	@$(BIN)/python benchmarks/all.py
 
 clean:
-	rm -rf $(VENV) build dist demo *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist demo site *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

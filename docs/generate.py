@@ -2,8 +2,8 @@
 
 log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
 groundproc/products, survey.md from the dataclasses of groundproc/survey, the table in methods/observations.md from the registry of
-groundproc/estimation/observations. health.schema.json is made from onboard/health.py. Run it after a
-change of these: python docs/generate.py
+groundproc/estimation/observations, commands.md from the parsers of the commands. health.schema.json is made from onboard/health.py.
+Run it after a change of these: python docs/generate.py
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from flightlog.records import FORMAT_VERSION, TABLE, RecordType
 from groundproc import products
 from groundproc.cloud import dimensions
 from groundproc.cloud.dimensions import Dimension
+from groundproc.commands.reference import commands_page
 from groundproc.estimation import observations
 from groundproc.survey import SECTIONS, Survey, sample
 from groundproc.survey.dynamic import DynamicOptions
@@ -321,7 +322,7 @@ def wrapped(text: str) -> str:
 
 _MADE: Final[dict[str, Callable[[], str]]] = {
     "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
-    "methods/observations.md": observations_page, "health.schema.json": health_schema,
+    "methods/observations.md": observations_page, "commands.md": commands_page, "health.schema.json": health_schema,
 }  # fmt: skip
 PAGES: Final[dict[str, Callable[[], str]]] = {
     name: (lambda made=made: wrapped(made())) if name.endswith(".md") else made for name, made in _MADE.items()

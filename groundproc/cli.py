@@ -161,14 +161,19 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _listing(found: dict[str, EntryPoint]) -> str:
-    """One line for each command."""
+    """One line for each command, by chapters."""
+    from groundproc.commands import grouped
+
+    width = max(map(len, found)) + 2
     lines = ["commands (swath COMMAND --help says more):"]
-    for name, point in found.items():
-        try:
-            about = point.load().HELP
-        except ImportError as error:
-            about = f"not available here: {error}"
-        lines.append(f"  {name:<12}{about}")
+    for chapter, names in grouped(found).items():
+        lines += ["", f"{chapter}:"]
+        for name in names:
+            try:
+                about = found[name].load().HELP
+            except ImportError as error:
+                about = f"not available here: {error}"
+            lines.append(f"  {name:<{width}}{about}")
     return "\n".join(lines)
 
 

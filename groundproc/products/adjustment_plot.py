@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final
@@ -20,16 +21,21 @@ Array = npt.NDArray[np.float64]
 BLIND_BELOW: Final = 50
 """Matched clusters of a tenth of a second below which the lidar has next to no planes."""
 AXES_OF: Final = {
-    "bias": "x y z", "scale": "x y z", "shear": "yz zx xy", "turn": "x y z", "accel_bias": "x y z", "accel_turn": "x y z",
-    "lever": "x y z", "delay": "", "drift": "", "compass": "const sin cos sin2 cos2",
+    "bias": ("x", "y", "z"), "scale": ("x", "y", "z"), "shear": ("yz", "zx", "xy"), "turn": ("x", "y", "z"),
+    "accel_bias": ("x", "y", "z"), "accel_turn": ("x", "y", "z"), "lever": ("x", "y", "z"),
+    "compass": ("const", "sin", "cos", "sin2", "cos2"),
+    "spin": ("x sin", "x cos", "y sin", "y cos", "z sin", "z cos"),
 }  # fmt: skip
 """What the numbers of an estimated parameter are of."""
 UNITS_OF: Final = {
     "bias": "deg/s", "scale": "%", "shear": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_turn": "deg",
     "lever": "cm", "delay": "ms", "drift": "ppm", "compass": "deg",
+    "spin": "deg", "spin_share": "%",
 }  # fmt: skip
-FACTORS: Final = {"scale": 100.0, "shear": 100.0, "lever": 100.0, "delay": 1000.0, "drift": 1e6}
+FACTORS: Final = {"scale": 100.0, "spin_share": 100.0, "shear": 100.0, "lever": 100.0, "delay": 1000.0, "drift": 1e6}
 """From the unit of quality.json to that of the table, where they differ."""
+_TITLE: Final = 150
+"""Characters that fit across the picture."""
 DOT: Final[dict[str, Any]] = {"marker": ".", "linestyle": "", "markersize": 3}
 
 
@@ -117,7 +123,8 @@ def title(sheet: Sheet) -> str:
         return ", ".join(parts)
     told = [f"lidar chi-square {last.pop('chi_square'):.2f}"]
     told += [f"{name.removesuffix('_rms')} {value:.2f}" for name, value in last.items()]
-    return ", ".join(parts) + "\nresiduals in sigma, last round: " + ", ".join(told)
+    lines = textwrap.wrap("residuals in sigma, last round: " + ", ".join(told), _TITLE)
+    return "\n".join([", ".join(parts), *lines])
 
 
 def draw_sheet(sheet: Sheet) -> Figure:
@@ -219,7 +226,7 @@ def _table(sheet: Sheet) -> list[tuple[list[str], bool]]:
             "shear": "cross-axis",
             "accel_turn": "accel misalignment",
         }.get(base, base)
-        axes = AXES_OF.get(base, "").split() or [""]
+        axes = AXES_OF.get(base, ("",))
         axis = axes[(i - names.index(key)) % len(axes)]
         numbers = (sheet.estimated_value[i], sheet.estimated_sigma[i], sheet.estimated_prior_sigma[i])
         texts = [f"{FACTORS.get(base, 1.0) * number:.3g}" if number else "0" for number in numbers]

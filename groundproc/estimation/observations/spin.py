@@ -98,7 +98,7 @@ class Spin:
         self.share += float(part[SHARE][0])
 
     def turns(self, value_rad: Array, every: int = 1) -> Array:
-        """Rotation vectors in the body on every so manieth pose of the grid, shape (m, 3)."""
+        """Rotation vectors in the body on every `every`-th pose of the grid, shape (m, 3)."""
         azimuth = self.azimuth_rad[::every, None]
         return np.asarray(np.sin(azimuth) * value_rad[0::2] + np.cos(azimuth) * value_rad[1::2])
 
