@@ -10,6 +10,7 @@ strip_bias_percent        largest difference of a strip of lasR's bcts from the 
 change_detection_rate     share of boxes of 1 dm3 found, 1000 points/m2 amid swaying shrubs
 change_false_per_100m2    claims that are none, there
 (those of uses_clouds.py)  ground, detection, wires, trees, buildings
+(those of uses_change.py)  what moved between two flights
 sight_exact_agreement     share of cells of 200 random surfaces where `exact` says what a dense walk along the line says
 sight_fast_agreement      share of cells of a terrain of a million cells where `fast` says what `exact` says
 sight_fast_ratio_to_gdal  CPU time of `fast` over that of GDAL, for it
@@ -30,6 +31,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import uses_change
 import uses_clouds
 from scipy.ndimage import gaussian_filter
 
@@ -252,6 +254,7 @@ FIGURES: Final[dict[str, Callable[[], Figures]]] = {
     "strips": strips,
     "change": change,
     "sight": sight,
+    **uses_change.FIGURES,
     **uses_clouds.FIGURES,
 }
 

@@ -1,7 +1,6 @@
 """`swath change`: two epochs laid on each other, and what appeared or vanished between them."""
 
 import json
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,20 +11,20 @@ import numpy.typing as npt
 import pyproj
 import shapely
 
-from flightlog.errors import GeodesyError, UsageError
+from flightlog.errors import UsageError
 from groundproc.analysis import changedetection as detection
 from groundproc.analysis.changedetection import Claim, Rule, Side
-from groundproc.analysis.registration import MOST, Registration, register
+from groundproc.analysis.deformation import surface as surfaces
+from groundproc.analysis.deformation.surface import Task as SurfaceTask
+from groundproc.analysis.epochs import Epochs, Progress, agreed_crs, laid
 from groundproc.cloud import reader
 from groundproc.cloud.merger import Merger
-from groundproc.cloud.reader import Cloud
 from groundproc.cloud.tiles import Found, Tiles, side_for
 from groundproc.files import made_folder, written_aside
 from groundproc.radiometry.sensorpath import SensorPath, flown, recovered
 from groundproc.vectors.features import Features, write_features
 
 Array = npt.NDArray[np.float64]
-Progress = Callable[[str, int], object]
 
 CHANGES: Final = "changes.geojson"
 REGISTRATION: Final = "registration.json"
@@ -58,6 +57,8 @@ class Task:
         They are on each other already.
     week : int or None
     undulation_m : float
+    surface : SurfaceTask or None
+        Measure the distance of surfaces too, like this.
     """
 
     a: Path
@@ -70,16 +71,7 @@ class Task:
     registered: bool = False
     week: int | None = None
     undulation_m: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Epochs:
-    clouds: tuple[Cloud, Cloud]
-    paths: tuple[SensorPath | None, SensorPath | None]
-    low: Array
-    high: Array
-    per_m2: float
-    registration: Registration
+    surface: SurfaceTask | None = None
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:
@@ -93,7 +85,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     if (task.trajectory_a is None) != (task.trajectory_b is None):
         raise UsageError("one trajectory given, expected --trajectory-a and --trajectory-b, or neither")
     clouds = (reader.look(task.a), reader.look(task.b))
-    crs = _common(clouds)
+    crs = agreed_crs(clouds)
     paths: tuple[SensorPath | None, SensorPath | None] = (None, None)
     if task.trajectory_a is not None and task.trajectory_b is not None:
         options: dict[str, Any] = {"week": task.week, "undulation_m": task.undulation_m}
@@ -101,14 +93,13 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     else:
         seen = (recovered(clouds[0]), recovered(clouds[1]))
         paths = seen if None not in seen else paths
-    samples, low, high, per_m2 = _look(clouds, progress)
-    registration = _unmoved(samples) if task.registered else register(samples[0], samples[1], f"{task.a} and {task.b}")
+    epochs = laid(clouds, paths, task.registered, progress)
+    per_m2, sigma_m = epochs.per_m2, epochs.registration.sigma_m
     edge = task.voxel_m or float(np.clip(_PER_EDGE / np.sqrt(per_m2), _SMALLEST_M, _LARGEST_M))
-    rule = Rule(edge, task.sway_m if task.sway_m is not None else max(0.25, 2.0 * edge), registration.sigma_m, per_m2)
-    epochs = _Epochs(clouds, paths, low, high, per_m2, registration)
+    rule = Rule(edge, task.sway_m if task.sway_m is not None else max(0.25, 2.0 * edge), sigma_m, per_m2)
     with made_folder(task.folder):
         found, claims = _compare(task, epochs, rule, progress)
-        told = _told(task, epochs, rule, claims)
+        told = _told(epochs, rule, claims)
         with ExitStack() as stack:
             for name in FILES[:2]:
                 aside = stack.enter_context(written_aside(task.folder / name))
@@ -118,60 +109,18 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
                     aside.write_text(json.dumps(told["registration"], indent=1) + "\n", encoding="utf-8")
             aside = stack.enter_context(written_aside(task.folder / CLOUD))
             _write_cloud(aside, epochs, found, progress)
+            if task.surface is not None:
+                told["surface"] = surfaces.compare(task.surface, epochs, task.folder, progress)
     return told
 
 
-def _common(clouds: tuple[Cloud, Cloud]) -> pyproj.CRS | None:
-    a, b = (cloud.horizontal for cloud in clouds)
-    if a is not None and b is not None and not a.equals(b, ignore_axis_order=True):
-        raise GeodesyError(f"{clouds[1].path}: is in {b.name}, but {clouds[0].path} in {a.name}; expected one CRS")
-    return a if a is not None else b
-
-
-def _look(clouds: tuple[Cloud, Cloud], progress: Progress) -> tuple[list[Array], Array, Array, float]:
-    """A sample of both for the registration, what they span, and points on a square metre of the sparser."""
-    samples, density = [], []
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for cloud in clouds:
-        step = max(1, -(-cloud.points // MOST))
-        parts, cells = [], np.empty(0, np.int64)
-        for chunk in reader.chunks(cloud, columns=()):
-            xyz = chunk.points.xyz_m
-            low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
-            parts.append(xyz[::step])
-            cell = np.floor(xyz[:, :2]).astype(np.int64)
-            cells = np.union1d(cells, (cell[:, 0] << 32) + (cell[:, 1] & 0xFFFFFFFF))
-            progress("looking", len(xyz))
-        samples.append(np.concatenate(parts))
-        density.append(cloud.points / max(len(cells), 1))
-    return samples, low, high, min(density)
-
-
-def _unmoved(samples: list[Array]) -> Registration:
-    return Registration(np.eye(4), samples[0].mean(axis=0), np.zeros((6, 6)), 0.0, 1.0, 1.0)
-
-
-def _chunks(epochs: _Epochs, number: int) -> Iterator[tuple[Array, Array]]:
-    """Places of an epoch in the frame of A, and the way from them to the sensor."""
-    path = epochs.paths[number]
-    for chunk in reader.chunks(epochs.clouds[number], None if path is None else path.clock, ()):
-        xyz = chunk.points.xyz_m
-        away = np.zeros((len(xyz), 3))
-        if path is not None:
-            place, known = path.at(chunk)
-            away[known] = (place - xyz)[known]
-        if number == 1:
-            xyz, away = epochs.registration.move(xyz), away @ epochs.registration.matrix[:3, :3].T
-        yield xyz, away
-
-
-def _compare(task: Task, epochs: _Epochs, rule: Rule, progress: Progress) -> tuple[Found, list[tuple[str, Claim]]]:
+def _compare(task: Task, epochs: Epochs, rule: Rule, progress: Progress) -> tuple[Found, list[tuple[str, Claim]]]:
     """Square by square, each epoch against the other."""
     points = epochs.clouds[0].points + epochs.clouds[1].points
     side = side_for(points, epochs.low.tolist(), epochs.high.tolist(), detection.HALO_M)
     tiles = Tiles(task.folder, {"epoch": "u1", "east": "f4", "north": "f4", "up": "f4"}, side, detection.HALO_M)
     for number in range(2):
-        for xyz, away in _chunks(epochs, number):
+        for _, xyz, away in epochs.chunks(number):
             epoch = np.full(len(xyz), number, np.uint8)
             tiles.add(xyz, {"epoch": epoch, "east": away[:, 0], "north": away[:, 1], "up": away[:, 2]})
             progress("placing", len(xyz))
@@ -209,7 +158,7 @@ def _compare(task: Task, epochs: _Epochs, rule: Rule, progress: Progress) -> tup
     return found, claims
 
 
-def _told(task: Task, epochs: _Epochs, rule: Rule, claims: list[tuple[str, Claim]]) -> dict[str, Any]:
+def _told(epochs: Epochs, rule: Rule, claims: list[tuple[str, Claim]]) -> dict[str, Any]:
     registration = epochs.registration
     sigma = np.sqrt(np.diag(registration.covariance))
     kinds = [kind for kind, _ in claims]
@@ -240,7 +189,7 @@ def _write_claims(path: Path, claims: list[tuple[str, Claim]], crs: pyproj.CRS |
     write_features(path, Features(geometry, columns, crs), "Point Z", "changes", ".geojson")
 
 
-def _write_cloud(path: Path, epochs: _Epochs, found: Found, progress: Progress) -> None:
+def _write_cloud(path: Path, epochs: Epochs, found: Found, progress: Progress) -> None:
     """All points of both, as they came, with what became of them."""
     start = 0
     with Merger(epochs.clouds, path, ("epoch", *_COLUMNS)) as merged:

@@ -207,6 +207,9 @@ TABLE: Final = (
     Dimension(
         "change_sigma", "f4", "sigma of change", "Of that distance: both epochs' roughness and the registration.", "`swath change`", "m",
     ),
+    Dimension(
+        "change_lod", "f4", "detectable at 95 %", "A smaller distance may be none: 1.96 sigmas of it.", "`swath change --surface`", "m",
+    ),
 )  # fmt: skip
 """All columns that points may have, in the order of the file and of the documentation."""
 

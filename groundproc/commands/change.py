@@ -22,6 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--registered", action="store_true", help="the clouds lie on each other already")
     parser.add_argument("--week", type=int, metavar="N", help="GPS week, where the files have only seconds of it")
     parser.add_argument("--geoid", type=float, default=0.0, metavar="N", help="taken off the trajectories' heights [m]")
+    surfaces = parser.add_argument_group(
+        "surfaces", "how far the ground moved along its normals (M3C2), and what was lost and gained"
+    )
+    surfaces.add_argument("--surface", action="store_true", help="write surface.laz and surface.geojson too")
+    surfaces.add_argument("--radius", type=float, metavar="M", help="of the cylinders; default: of 30 points")
+    surfaces.add_argument(
+        "--reach", type=float, default=2.0, metavar="M", help="how far a surface may have moved; default: 2"
+    )
+    surfaces.add_argument("--spacing", type=float, metavar="M", help="between core points; default: two radii")
+    surfaces.add_argument("--ground", action="store_true", help="points of class 2 only")
+    surfaces.add_argument(
+        "--registration-sigma",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="with --registered: how well they lie on each other",
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the results")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)
@@ -34,20 +51,29 @@ def run(arguments: argparse.Namespace) -> int:
     from flightlog.errors import UsageError
     from groundproc.analysis.change import FILES, Task
     from groundproc.analysis.change import run as compare
+    from groundproc.analysis.deformation import surface
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, SOLUTION_WORDS, SOLUTIONS, expect
     from groundproc.commands.outputs import claim_file, claim_folder, write_json
 
-    for word, value in (("--voxel", arguments.voxel), ("--sway", arguments.sway)):
+    for word in ("voxel", "sway", "radius", "reach", "spacing"):
+        value = getattr(arguments, word)
         if value is not None and not 0.0 < value <= 100.0:
-            raise UsageError(f"{word} {value:g}: expected more than 0 and up to 100 m")
+            raise UsageError(f"--{word} {value:g}: expected more than 0 and up to 100 m")
+    if not 0.0 <= arguments.registration_sigma <= 100.0:
+        raise UsageError(f"--registration-sigma {arguments.registration_sigma:g}: expected 0 to 100 m")
     expect([arguments.a, arguments.b], CLOUD, CLOUD_WORDS)
     expect([arguments.trajectory_a, arguments.trajectory_b], SOLUTIONS, SOLUTION_WORDS)
-    claim_folder(arguments.output, FILES, arguments.force)
+    measured = None
+    if arguments.surface:
+        measured = surface.Task(
+            arguments.radius, arguments.reach, arguments.spacing, arguments.ground, arguments.registration_sigma
+        )
+    claim_folder(arguments.output, FILES + (surface.FILES if arguments.surface else ()), arguments.force)
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
     task = Task(
         arguments.a, arguments.b, arguments.output, arguments.trajectory_a, arguments.trajectory_b, arguments.voxel, arguments.sway,
-        arguments.registered, arguments.week, arguments.geoid,
+        arguments.registered, arguments.week, arguments.geoid, measured,
     )  # fmt: skip
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 
@@ -65,4 +91,11 @@ def run(arguments: argparse.Namespace) -> int:
         f"{told['appeared']} appeared ({told['appeared_m3']:.3f} m3), {told['vanished']} vanished ({told['vanished_m3']:.3f} m3), "
         f"voxels of {told['voxel_m']:.2f} m; {arguments.output}"
     )
+    if measured is not None:
+        ground = told["surface"]
+        print(
+            f"surface: {ground['lost_m3']:.3f} +- {ground['lost_sigma_m3']:.3f} m3 lost, {ground['gained_m3']:.3f} +- "
+            f"{ground['gained_sigma_m3']:.3f} m3 gained in {ground['areas']} areas; {ground['lod95_m'] * 1e3:.1f} mm are told from none "
+            "at 95 %"
+        )
     return 0

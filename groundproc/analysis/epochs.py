@@ -1,0 +1,128 @@
+"""Two epochs of a place, the later one laid on the earlier: what `swath change` and its surfaces look at."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+
+from flightlog.errors import GeodesyError
+from groundproc.analysis.registration import MOST, Registration, register
+from groundproc.cloud import reader
+from groundproc.cloud.metres import metres_of
+from groundproc.cloud.reader import Chunk, Cloud
+from groundproc.radiometry.sensorpath import SensorPath
+
+Array = npt.NDArray[np.float64]
+Progress = Callable[[str, int], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Epochs:
+    """The earlier and the later cloud.
+
+    Attributes
+    ----------
+    clouds : tuple of 2 Cloud
+    paths : tuple of 2 (SensorPath or None)
+        Where the sensor was.
+    low, high : ndarray, shape (3,)
+        What both span, before the later one is moved [m].
+    per_m2 : float
+        Points on a square metre of the sparser one.
+    registration : Registration
+        The later on the earlier.
+    registered : bool
+        They were taken as they are; the registration is none.
+    """
+
+    clouds: tuple[Cloud, Cloud]
+    paths: tuple[SensorPath | None, SensorPath | None]
+    low: Array
+    high: Array
+    per_m2: float
+    registration: Registration
+    registered: bool
+
+    @property
+    def crs(self) -> pyproj.CRS | None:
+        """Horizontal, of both."""
+        return agreed_crs(self.clouds)
+
+    def chunks(self, number: int, columns: tuple[str, ...] = ()) -> Iterator[tuple[Chunk, Array, Array]]:
+        """Chunks of an epoch, their places in the frame of A, and the way from them to the sensor (0: not known)."""
+        path = self.paths[number]
+        for chunk in reader.chunks(self.clouds[number], None if path is None else path.clock, columns):
+            xyz = chunk.points.xyz_m
+            away = np.zeros((len(xyz), 3))
+            if path is not None:
+                place, known = path.at(chunk)
+                away[known] = (place - xyz)[known]
+            if number == 1:
+                xyz, away = self.registration.move(xyz), away @ self.registration.matrix[:3, :3].T
+            yield chunk, xyz, away
+
+
+def laid(
+    clouds: tuple[Cloud, Cloud],
+    paths: tuple[SensorPath | None, SensorPath | None],
+    registered: bool,
+    progress: Progress,
+) -> Epochs:
+    """Look at both, and lay the later one on the earlier unless they lie so already.
+
+    Raises
+    ------
+    CoverageError
+        They have no place in common, or do not fit.
+    GeodesyError
+        Their coordinates are not metres.
+    """
+    for cloud in clouds:
+        if not metres_of(cloud).plain:
+            assert cloud.horizontal is not None
+            raise GeodesyError(
+                f"{cloud.path}: is in {cloud.horizontal.name}, which is not in metres; expected a CRS that is"
+            )
+    samples, low, high, per_m2 = _look(clouds, progress)
+    what = f"{clouds[0].path} and {clouds[1].path}"
+    found = _unmoved(samples) if registered else register(samples[0], samples[1], what)
+    return Epochs(clouds, paths, low, high, per_m2, found, registered)
+
+
+def agreed_crs(clouds: tuple[Cloud, Cloud]) -> pyproj.CRS | None:
+    """The CRS of both; None where neither says.
+
+    Raises
+    ------
+    GeodesyError
+        They differ.
+    """
+    a, b = (cloud.horizontal for cloud in clouds)
+    if a is not None and b is not None and not a.equals(b, ignore_axis_order=True):
+        raise GeodesyError(f"{clouds[1].path}: is in {b.name}, but {clouds[0].path} in {a.name}; expected one CRS")
+    return a if a is not None else b
+
+
+def _look(clouds: tuple[Cloud, Cloud], progress: Progress) -> tuple[list[Array], Array, Array, float]:
+    """A sample of both for the registration, what they span, and points on a square metre of the sparser."""
+    samples, density = [], []
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for cloud in clouds:
+        step = max(1, -(-cloud.points // MOST))
+        parts, cells = [], np.empty(0, np.int64)
+        for chunk in reader.chunks(cloud, columns=()):
+            xyz = chunk.points.xyz_m
+            low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+            parts.append(xyz[::step])
+            cell = np.floor(xyz[:, :2]).astype(np.int64)
+            cells = np.union1d(cells, (cell[:, 0] << 32) + (cell[:, 1] & 0xFFFFFFFF))
+            progress("looking", len(xyz))
+        samples.append(np.concatenate(parts))
+        density.append(cloud.points / max(len(cells), 1))
+    return samples, low, high, min(density)
+
+
+def _unmoved(samples: list[Array]) -> Registration:
+    return Registration(np.eye(4), samples[0].mean(axis=0), np.zeros((6, 6)), 0.0, 1.0, 1.0)
