@@ -1,8 +1,9 @@
 """Writes the pages that are tables of the programs, so that page and programs cannot differ.
 
 log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
-groundproc/products, survey.md from the dataclasses of groundproc/survey, the table in methods/observations.md from the registry of
-groundproc/estimation/observations, commands.md from the parsers of the commands. health.schema.json is made from onboard/health.py.
+groundproc/products, uses/processing.md from that of groundproc/uses, survey.md from the dataclasses of groundproc/survey, the table in
+methods/observations.md from the registry of groundproc/estimation/observations, commands.md from the parsers of the commands.
+health.schema.json is made from onboard/health.py.
 Run it after a change of these: python docs/generate.py
 """
 
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flightlog.records import FORMAT_VERSION, TABLE, RecordType
-from groundproc import products
+from groundproc import products, uses
 from groundproc.cloud import dimensions
 from groundproc.cloud.dimensions import Dimension
 from groundproc.commands.reference import commands_page
@@ -185,6 +186,34 @@ def products_page() -> str:
     return _PRODUCTS + "\n".join(rows) + "\n"
 
 
+_USES: Final = """\
+# Uses as a part of processing
+
+<!-- Made by docs/generate.py from the registry of groundproc/uses: change that, not this. -->
+
+`swath process` makes these of the finished cloud where the survey asks for them:
+
+```yaml
+uses: [ground, {wires: {least_height_m: 5}}]
+targets: panels.geojson # of use reflectance
+```
+
+On the command line it is `--uses ground,wires`. Each use leaves its files in `uses/` of the flight's folder, and `NAME.json` with what it
+found; the report tells of all of them, and shows their rasters. Each is entered in the ledger by itself: one more costs its own work, a
+changed option makes that use alone again, and an interrupted run goes on with the next ([processing.md](../processing.md)). What a use
+warns of is said at the end. The command of the same name does the same with any cloud.
+"""
+
+
+def uses_page() -> str:
+    """docs/uses/processing.md: every use with its files and options."""
+    parts = [_USES]
+    for each in uses.chosen(list(uses.REGISTRY)):
+        parts += [f"## {each.name}\n", f"[{each.name}.md]({each.name}.md). Makes {uses.REGISTRY[each.name].about}.\n"]
+        parts += ["| option | default | what it is |", "|---|---|---|", *_nested_rows(each.options[0], ""), ""]
+    return "\n".join(parts).rstrip() + "\n"
+
+
 _KINDS: Final = re.compile(r"(<!-- kinds: [^\n]*-->\n).*?(<!-- end of kinds -->)", re.DOTALL)
 
 
@@ -322,6 +351,7 @@ def wrapped(text: str) -> str:
 
 _MADE: Final[dict[str, Callable[[], str]]] = {
     "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
+    "uses/processing.md": uses_page,
     "methods/observations.md": observations_page, "commands.md": commands_page, "health.schema.json": health_schema,
 }  # fmt: skip
 PAGES: Final[dict[str, Callable[[], str]]] = {

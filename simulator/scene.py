@@ -194,6 +194,9 @@ def panels(rng: np.random.Generator) -> Place:
         distance, heading = distances[i // 3], np.radians(headings[slot])
         at = np.array([distance * np.sin(heading), distance * np.cos(heading), 1.5])
         add_panel(parts, f"{material} at {distance:.0f} m", material, at, headings[slot] + 180.0)
+    # two surfaces in one footprint: a step of 0.3 m, which a pulse of 4 ns cannot tell apart
+    add_panel(parts, "step front", "panel_30.3", np.array([0.0, 10.0, 3.0]), 180.0)
+    parts.add("step back", "panel_81.3", quad((-1.0, 10.3, 2.0), (2.0, 0, 0), (0, 0, 2.0)))
     return parts.world(), {"stand": Route(points_m=((0.0, 0.0, 1.5),), heading_deg=0.0, kind="tripod")}, Tracks()
 
 

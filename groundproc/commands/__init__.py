@@ -10,10 +10,10 @@ CHAPTERS: Final = {
     "before the flight": ("plan", "simulate"),
     "recordings": ("pull", "info", "import", "recover", "replay", "bag"),
     "from flight to cloud": ("init", "process", "batch", "live", "report", "view", "decode"),
-    "trajectory and calibration": ("calibrate", "compass", "ppk", "adjust"),
+    "trajectory and calibration": ("calibrate", "compass", "ppk", "adjust", "verify-sensor"),
     "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse"),
     "what people fly for": (
-        "ground", "trees", "wires", "detect", "change", "viewshed", "reflectance", "orthophoto",
+        "ground", "trees", "wires", "detect", "change", "viewshed", "passability", "reflectance", "orthophoto",
     ),
     "images": ("images", "colour", "ortho", "ndvi"),
     "this computer": ("warmup", "completion"),

@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.progress import stages
     from groundproc.steps import ORDER
     from groundproc.steps.process import process
+    from groundproc.uses import REGISTRY
 
     request, folder = _request(arguments)
     if arguments.status:
@@ -59,6 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     until = arguments.until or ORDER[-1]
     names = {"read": "clocks and autopilot", "adjust": "trajectory", "place": "points"}
     counted = {"images": "images adjusted", "colour": "colours", "ortho": "ortho mosaic", "ndvi": "vegetation index"}
+    counted |= {name: f"{name} [points]" for name in REGISTRY}
     try:
         with stages(request.logs, names, counted) as progress:
             found = process(request, folder, progress, until=until, force=arguments.force)
@@ -69,7 +71,20 @@ def run(arguments: argparse.Namespace) -> int:
         _print_states(found, folder, arguments.json)
         return 0
     quality = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
+    _tell_uses(folder, arguments.json)
     return _tell(quality, folder, arguments.json)
+
+
+def _tell_uses(folder: Path, as_json: bool) -> None:
+    """What each use found, and what it warns of; with --json the warnings alone."""
+    from groundproc.reporting import usesfound
+    from groundproc.verdict import warnings_in
+
+    for each in usesfound.read(folder):
+        if not as_json:
+            print(f"{each['use']}: {each['found']}; in {folder / usesfound.FOLDER}")
+        for warning in warnings_in(each["figures"]):
+            print(f"swath: warning: {each['use']}: {warning}", file=sys.stderr, flush=True)
 
 
 def _tell(quality: dict[str, Any], folder: Path, as_json: bool) -> int:
@@ -137,6 +152,7 @@ def _expect_named(survey: Survey) -> None:
     for name, kinds, expected in (
         (survey.area, AREA, AREA_WORDS),
         (survey.positions, (*SOLUTIONS, "table", "text"), SOLUTION_WORDS),
+        (survey.targets, ("bag", "json", "text"), "polygons (.geojson or .gpkg)"),
         (survey.control, ("control", "table", "text"), "a table of control points (CSV: x, y, z, sigma)"),
     ):
         if name is not None and Path(name).exists():  # one that is not there, its reader names

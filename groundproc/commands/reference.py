@@ -13,11 +13,11 @@ READ_ON: Final = {
     "detect": "uses/detect.md", "export": "clouds.md", "fuse": "uses/fuse.md", "ground": "uses/ground.md",
     "images": "imagery.md", "import": "importing.md", "info": "importing.md", "init": "survey.md",
     "live": "methods/live.md", "ndvi": "imagery.md", "ortho": "imagery.md", "orthophoto": "uses/reflectance.md",
-    "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
+    "passability": "uses/passability.md", "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
     "pull": "install.md#get-the-logs-swath-pull", "raster": "clouds.md", "recover": "aircraft.md#flight-logs",
     "reflectance": "uses/reflectance.md", "replay": "tutorial.md", "report": "report.md", "section": "uses/section.md",
     "simulate": "simulator.md", "tin": "clouds.md#triangles-for-design-and-machine-control", "trees": "uses/trees.md",
-    "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
+    "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
     "warmup": "install.md#on-the-ground-compile-once", "wires": "uses/wires.md",
 }  # fmt: skip
 """Pages that say what a command is for and how it works."""

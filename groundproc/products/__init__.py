@@ -89,13 +89,19 @@ class Chosen:
         return isinstance(self.maker, type)
 
 
-def chosen(wanted: Sequence[Any] | None) -> list[Chosen]:
+def chosen(
+    wanted: Sequence[Any] | None, registry: Mapping[str, Entry] = REGISTRY, what: str = "products"
+) -> list[Chosen]:
     """The products of a survey, in the order of the registry.
 
     Parameters
     ----------
     wanted : sequence of str or mapping, optional
         Names; or one name with its options, `{"dsm.tif": {"cell_m": 0.5}}`. Default: all that are made by default.
+    registry : mapping of str to Entry
+        Of products, or of other things that a survey chooses alike.
+    what : str
+        The key of the survey, for sentences.
 
     Raises
     ------
@@ -103,16 +109,19 @@ def chosen(wanted: Sequence[Any] | None) -> list[Chosen]:
         A name or an option that there is not, or a product named twice.
     """
     if wanted is None:
-        wanted = [name for name, entry in REGISTRY.items() if entry.by_default]
+        wanted = [name for name, entry in registry.items() if entry.by_default]
     options: dict[str, Any] = {}
+    always = ALWAYS if registry is REGISTRY else ()
     for item in wanted:
-        if item in ALWAYS:
+        if item in always:
             continue
-        name, given = _read(item)
+        name = _name(item)
+        if name is None or name not in registry:
+            raise ConfigError(f"{what}: {item!r} found, expected some of {', '.join((*registry, *always))}")
         if name in options:
-            raise ConfigError(f"products: {name!r} stands there twice, expected once")
-        options[name] = given
-    return [_loaded(name, options[name]) for name in REGISTRY if name in options]
+            raise ConfigError(f"{what}: {name!r} stands there twice, expected once")
+        options[name] = item[name] if isinstance(item, Mapping) else {}
+    return [_loaded(name, registry[name], options[name], what) for name in registry if name in options]
 
 
 def plain(products: Iterable[Chosen]) -> dict[str, Any]:
@@ -120,22 +129,17 @@ def plain(products: Iterable[Chosen]) -> dict[str, Any]:
     return {each.name: [config.to_mapping(options) for options in each.options] for each in products}
 
 
-def _read(item: Any) -> tuple[str, Any]:
-    """Name and options of one item of the survey's list."""
+def _name(item: Any) -> str | None:
+    """Name in one item of the survey's list; None where there is none."""
     if isinstance(item, Mapping) and len(item) == 1:
-        ((item, given),) = item.items()
-    else:
-        given = {}
-    if not isinstance(item, str) or item not in REGISTRY:
-        raise ConfigError(f"products: {item!r} found, expected some of {', '.join((*REGISTRY, *ALWAYS))}")
-    return item, given
+        (item,) = item
+    return item if isinstance(item, str) else None
 
 
-def _loaded(name: str, given: Any) -> Chosen:
-    entry = REGISTRY[name]
+def _loaded(name: str, entry: Entry, given: Any, what: str) -> Chosen:
     module = importlib.import_module(entry.module)
     own = getattr(module, "Options", None)
     if own is None and given:
-        raise ConfigError(f"products: {name}: {given!r} found, but it has no options")
-    options = () if own is None else (config.from_mapping(given, own, f"products: {name}"),)
+        raise ConfigError(f"{what}: {name}: {given!r} found, but it has no options")
+    options = () if own is None else (config.from_mapping(given, own, f"{what}: {name}"),)
     return Chosen(name, getattr(module, entry.attribute), options)

@@ -5,6 +5,7 @@ from typing import Final
 
 from flightlog.config import option
 from groundproc.products.product import Context
+from groundproc.reporting import usesfound
 from groundproc.reporting.flightreport import Subject, compose
 from groundproc.vectors.tracks import pieces
 
@@ -31,6 +32,7 @@ def write(context: Context, options: Options) -> None:
     """Write it, of what lies in the folder."""
     trajectory = context.estimate.trajectory
     paths = [context.projection.exact(trajectory.position_m[some]) for some in pieces(trajectory)]
-    subject = Subject(context.finished, context.quality, context.estimate, paths, context.digests)
+    found = usesfound.read(context.finished)
+    subject = Subject(context.finished, context.quality, context.estimate, paths, context.digests, found)
     text = compose(subject, options.points, int(options.most_mb * 1e6))
     context.aside(FILE).write_text(text, encoding="utf-8")

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.raster import geotiff
-from groundproc.reporting import cloudpart, imagepart, maps, words
+from groundproc.reporting import cloudpart, imagepart, maps, usesfound, words
 from groundproc.reporting.charts import charts
 from groundproc.reporting.cloudpart import CloudPart
 from groundproc.reporting.markup import Html, joined, section, tag
@@ -43,6 +43,8 @@ class Subject:
         Covered pieces of the trajectory in the CRS of the points.
     digests : mapping of str to str
         SHA-256 of inputs and products by name.
+    uses : sequence of mapping
+        What the uses found (`usesfound.read`).
     """
 
     folder: Path
@@ -50,6 +52,7 @@ class Subject:
     estimate: Estimate
     paths: Sequence[Array]
     digests: Mapping[str, str]
+    uses: Sequence[Mapping[str, Any]] = ()
 
 
 def compose(subject: Subject, most_points: int, most_bytes: int) -> str:
@@ -95,6 +98,7 @@ def _after(subject: Subject, part: CloudPart | None) -> Html:
     curves = tag("div", [draw(plot) for plot in charts(subject.estimate)], class_="plots")
     return joined(
         [
+            usesfound.told(subject.uses),
             _maps(subject, part),
             imagepart.images(quality, subject.folder, list(subject.digests)),
             section("quality", "Quality over time", curves),

@@ -133,6 +133,18 @@ class Velodyne:
         for part, times in by_mode(packets, time_ns):
             yield firings.decode(self.firing, part, times, gate, lasers or self.lasers)
 
+    @property
+    def nothing_m(self) -> float:
+        """Range of the shots without an echo in `with_all_shots`: the least that the sensor could state, and never does."""
+        return self.range_step_m
+
+    def with_all_shots(self, packets: Records) -> Records:
+        """Packets in which a shot without an echo has one at `nothing_m`, so that `decode` gives every shot that was fired."""
+        told = packets.copy()
+        ranges = data_of(told)["blocks"]["returns"]["range"]
+        ranges[ranges == 0] = 1
+        return told
+
     def blanks(self) -> Iterator[Records]:
         """See Lidar."""
         for mode in (ReturnMode.STRONGEST, ReturnMode.DUAL):

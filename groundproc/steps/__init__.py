@@ -5,12 +5,13 @@ ledger of the output folder (`ledger.Ledger`), so that a second run does only wh
 
 log --clocks--> one time scale --trajectory--> estimate --place--> points and products --quality--> quality.json
 photographs, estimate, points --images--> poses of images --colour, ortho, ndvi--> coloured cloud, mosaics
-estimate, quality.json --products--> pictures and tables
+cloud.laz, estimate --uses--> ground, trees, wires, ...
+estimate, quality.json, uses --products--> pictures and tables
 """
 
 from typing import Final
 
-ORDER: Final = ("clocks", "trajectory", "place", "images", "colour", "ortho", "ndvi", "quality", "products")
+ORDER: Final = ("clocks", "trajectory", "place", "images", "colour", "ortho", "ndvi", "quality", "uses", "products")
 """The steps, each a module of this package with a `STEP`."""
 OF_IMAGES: Final = ("images", "colour", "ortho", "ndvi")
 """Those that have something to do only where there are photographs."""

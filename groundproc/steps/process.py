@@ -121,8 +121,8 @@ def _bring_up_to_date(step: Step, run: Run, ledger: Ledger, force: bool) -> None
     """Make the parts of a step that are not as they should be; what is not asked for any more goes."""
     parts = step.parts(run.request)
     due = [part for part in parts if force or reasons(step, part, run.request, ledger)]
-    if due:
-        execute(step, due, run, ledger, force)
+    for some in [[part] for part in due] if step.singly else [due] * bool(due):
+        execute(step, some, run, ledger, force)
     for unit in [unit for unit in ledger.entries if unit.partition(BETWEEN)[0] == step.name]:
         if unit not in step.units(run.request):
             ledger.drop(unit)

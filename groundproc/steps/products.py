@@ -58,7 +58,7 @@ def digests_of(folder: Path) -> dict[str, str]:
 STEP: Final = Step(
     name="products",
     about="pictures and tables of what the other steps found",
-    after=("trajectory", "place", *OF_IMAGES, "quality"),
+    after=("trajectory", "place", *OF_IMAGES, "quality", "uses"),
     reads_logs=False,
     settings=settings,
     work=work,

@@ -47,6 +47,8 @@ class Step:
     parts : callable
         What of it can be made alone, such as one of several products: settings of each that concern no other, by name. A step that is one
         thing has one part without a name.
+    singly : bool
+        Parts are made one after the other and entered in the ledger each when it is there; else in one go, which may share its work.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Step:
     files: Callable[[Request], Mapping[str, Path]] = lambda request: {}
     check: Callable[[Request], None] = lambda request: None
     parts: Callable[[Request], Mapping[str, Any]] = lambda request: {WHOLE: {}}
+    singly: bool = False
 
     def unit(self, part: str) -> str:
         """Name of a part in the ledger."""

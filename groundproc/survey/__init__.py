@@ -291,7 +291,32 @@ class OutputSettings:
 
 
 @dataclass(frozen=True)
+class UseSettings:
+    """Uses: what people fly for, made of the finished cloud."""
+
+    uses: tuple[Any, ...] | None = setting(
+        None,
+        "what is made of the cloud, by name, such as ground,wires: see docs/uses/processing.md",
+        words=("--uses",),
+        metavar="NAMES",
+        reads="names",
+        absent="nothing",
+        in_file="a list; a name with options of its own is a mapping: [ground, {NAME: {OPTION: VALUE}}]",
+    )
+    targets: str | None = setting(
+        None,
+        "use reflectance: polygons of known reflectance (.geojson, .gpkg), as `swath reflectance` takes them",
+        words=("--targets",),
+        metavar="FILE",
+        reads="file",
+        absent="reflectance is relative",
+        in_file=BESIDE,
+    )
+
+
+@dataclass(frozen=True)
 class Survey(
+    UseSettings,
     OutputSettings,
     ImageSettings,
     TrimSettings,
@@ -313,10 +338,11 @@ SECTIONS: Final = (
     TrimSettings,
     ImageSettings,
     OutputSettings,
+    UseSettings,
 )
 """In the order of the flight from log to products."""
 FILES: Final = (
-    "mount", "positions", "poses", "control", "lasers", "compass", "area", "images", "rig", "image_times", "panels"
+    "mount", "positions", "poses", "control", "lasers", "compass", "area", "images", "rig", "image_times", "panels", "targets"
 )  # fmt: skip
 """Options that name a file or a folder, looked for beside survey.yaml."""
 

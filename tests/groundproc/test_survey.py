@@ -41,6 +41,7 @@ OTHERS: dict[str, object] = {
     "fov_deg": [0.0, 360.0],
     "pose_grid_ms": 10.0,
     "products": ["cloud.laz"],
+    "uses": ["ground"],
 }
 """Values of options that are not seen from their defaults and bounds."""
 

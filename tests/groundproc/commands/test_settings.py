@@ -24,6 +24,7 @@ TYPED = {
     "boresight_sigma_deg": (["--boresight-sigma-deg", "0.1"], 0.1), "crs": (["--epsg", "EPSG:3006"], "EPSG:3006"),
     "crs_anyway": (["--crs-anyway"], True), "height": (["--height", "relative"], "relative"), "geoid": (["--geoid", "29.35"], "29.35"),
     "products": (["--products", "cloud.laz, pictures"], ("cloud.laz", "pictures")),
+    "uses": (["--uses", "ground, trees"], ("ground", "trees")), "targets": (["--targets", "t.gpkg"], "t.gpkg"),
 }  # fmt: skip
 
 

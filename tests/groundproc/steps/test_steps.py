@@ -19,7 +19,7 @@ from groundproc.steps import ORDER as ALL
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.step import steps
 
-ORDER = tuple(name for name in ALL if name not in OF_IMAGES)
+ORDER = tuple(name for name in ALL if name not in (*OF_IMAGES, "uses"))
 """The steps of a flight without photographs."""
 PATIENCE_S = 300.0
 COMPLETE = (0, 3)
@@ -146,7 +146,7 @@ def test_every_setting_is_looked_at_by_some_step() -> None:
     quality = next(step for step in steps() if step.name == "quality")
     assert set(quality.settings(requests[0])) == fields
     looked_at = {name for step in makers for request in requests for name in step.settings(request)}
-    assert looked_at == fields - {"products"}
+    assert looked_at == fields - {"products", "uses"}
     assert any("place: cloud.laz" in step.units(requests[0]) for step in makers)  # products are parts
 
 
