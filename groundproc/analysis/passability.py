@@ -18,9 +18,10 @@ from flightlog.config import option
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis.passage.relief import REACH, planes, steps
 from groundproc.analysis.passage.route import MOST_CELLS, Cell, best_route
-from groundproc.analysis.terrain.floor import GROUND, Floor
+from groundproc.analysis.terrain.floor import Floor
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.cloud import reader
+from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE
 from groundproc.files import made_folder, written_aside
 from groundproc.raster import geotiff
 from groundproc.raster.cells import Cells
@@ -125,7 +126,7 @@ class _Area:
             within -= np.floor(within) + 0.5
             east.add(bare, within[:, 0] * cell_m)
             north.add(bare, within[:, 1] * cell_m)
-            below = ~noise & (above < task.vehicle.height_m) & (kind != 18) & (kind != 7)
+            below = ~noise & (above < task.vehicle.height_m) & (kind != HIGH_NOISE) & (kind != LOW_NOISE)
             top.add(xyz[below], xyz[below, 2])
             seen.add(xyz[~noise], xyz[~noise, 2])
         grid = seen.grid()
