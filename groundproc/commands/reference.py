@@ -12,7 +12,7 @@ READ_ON: Final = {
     "compass": "methods/dynamic.md", "completion": "tutorial.md", "contours": "clouds.md#contours", "decode": "sensors.md",
     "detect": "uses/detect.md", "export": "clouds.md", "fuse": "uses/fuse.md", "ground": "uses/ground.md",
     "images": "imagery.md", "import": "importing.md", "info": "importing.md", "init": "survey.md",
-    "live": "methods/live.md", "ndvi": "imagery.md", "ortho": "imagery.md", "orthophoto": "uses/reflectance.md",
+    "live": "methods/live.md", "merge": "clouds.md#several-flights-in-one-cloud", "ndvi": "imagery.md", "ortho": "imagery.md", "orthophoto": "uses/reflectance.md",
     "passability": "uses/passability.md",
     "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
     "pull": "install.md#get-the-logs-swath-pull", "raster": "clouds.md", "recover": "aircraft.md#flight-logs",
