@@ -280,7 +280,7 @@ def _common(first: _Relief, other: _Relief) -> tuple[tuple[slice, slice], tuple[
 
 def _at(first: _Relief, b: Array, place: Array, cell_m: float, spread: float) -> tuple[float, float]:
     """Sigmas and correlation at one place."""
-    other = _relief_of(_turned(b, place[0]) + (place[1], place[2], 0.0), cell_m)
+    other = _relief_of(_turned(b, place[0]) + np.array([place[1], place[2], 0.0]), cell_m)
     common = _common(first, other)
     if common is None:
         return 0.0, 0.0
@@ -298,7 +298,7 @@ def _at(first: _Relief, b: Array, place: Array, cell_m: float, spread: float) ->
 
 def _height(a: Array, b: Array, best: _Candidate, cell_m: float) -> float:
     """How far A lies above B, by the tops of the cells that both have."""
-    first, other = _relief_of(a, cell_m), _relief_of(_turned(b, best.turn_rad) + (*best.shift, 0.0), cell_m)
+    first, other = _relief_of(a, cell_m), _relief_of(_turned(b, best.turn_rad) + np.array([*best.shift, 0.0]), cell_m)
     common = _common(first, other)
     assert common is not None
     both = first.known[common[0]] & other.known[common[1]]
