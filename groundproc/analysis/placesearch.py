@@ -7,7 +7,7 @@ is an answer; at two places, it is none.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from flightlog.errors import CoverageError
 
 Array = npt.NDArray[np.float64]
 Sheet = npt.NDArray[np.float32]
+Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
 
 _CELLS: Final = 160
 """Along the longer side of the larger cloud."""
@@ -186,7 +187,7 @@ class _Correlator:
         known = b.known.astype(np.float32)
         mask, value, square = (np.conj(fft.rfft2(each, self._shape)) for each in (known, b.relief, b.relief**2))
 
-        def together(first: Sheet, second: Sheet) -> Sheet:
+        def together(first: Spectrum, second: Spectrum) -> Sheet:
             return np.asarray(fft.irfft2(first * second, self._shape))
 
         both = np.maximum(together(self._of_a[0], mask), 1.0)
