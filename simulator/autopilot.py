@@ -6,7 +6,7 @@ taken when a message is built; the state in it may be up to a main loop older. E
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -56,7 +56,7 @@ def achieved_hz(asked_hz: float, firmware: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """One instant at which a message is built."""
+    """One instant at which a message is built; of exposures which."""
 
     time_s: float
     boot_ns: int
@@ -66,6 +66,7 @@ class _Moment:
     row: int
     belief: Belief
     geodetic: tuple[Array, Array, Array]
+    event: int = 0
 
     @property
     def boot_ms(self) -> int:
@@ -119,8 +120,9 @@ class Autopilot:
             if self._reboot.silent(time_s):
                 continue
             self._restart(time_s)
-            moment = self._moment(time_s, row, belief, place)
-            data = self._pack(self._builders[name](moment))
+            kind, _, number = name.partition(" ")
+            moment = replace(self._moment(time_s, row, belief, place), event=int(number or 0))
+            data = self._pack(self._builders[kind](moment))
             self._last_received_s = max(self._last_received_s, time_s + late_s[row])
             noise = garbage_before(rng, self._garbage_hz / sum(self.rates_hz.values()))
             yield Frame(time_s, self._last_received_s, data, noise)
@@ -147,9 +149,9 @@ class Autopilot:
             times.append(own)
             names += [name] * len(own)
         sent_s = self._noted_s + _FEEDBACK_LATE_S
-        own = sent_s[(sent_s >= start_s) & (sent_s < end_s)]
-        times.append(own)
-        names += [_FEEDBACK] * len(own)
+        mine = np.flatnonzero((sent_s >= start_s) & (sent_s < end_s))
+        times.append(sent_s[mine])
+        names += [f"{_FEEDBACK} {number}" for number in mine.tolist()]
         joined = np.concatenate(times)
         order = np.argsort(joined, kind="stable")
         return joined[order], [names[i] for i in order]
@@ -260,8 +262,7 @@ class Autopilot:
         return ardupilotmega.MAVLink_vfr_hud_message(speed, speed, heading, 48, height_m, float(up))
 
     def _camera_feedback(self, m: _Moment) -> Any:
-        which = int(np.argmin(np.abs(self._noted_s + _FEEDBACK_LATE_S - m.time_s)))
-        one = self._noted[which]
+        one = self._noted[m.event]
         latitude, longitude, height_mm = self._place(m)
         b, i = m.belief, m.row
         angles = np.degrees([b.roll_rad[i], b.pitch_rad[i], b.heading_rad[i] % (2 * np.pi)])

@@ -1,6 +1,7 @@
 """`swath images`: a block of images adjusted, with or without lidar, INS and control."""
 
 import argparse
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -41,7 +42,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--marks", type=Path, metavar="CSV", help="the same beside what is matched")
     parser.add_argument("--start", type=Path, metavar="CSV", help="first poses, columns of poses.csv; no observations")
-    parser.add_argument("--times", type=Path, metavar="FILE", help="which image when: .MRK, or a CSV with image,utc_ns")
+    parser.add_argument(
+        "--times",
+        type=Path,
+        metavar="FILE",
+        help="which image when: .MRK, a CSV with image,utc_ns, or a log (.mcap, .tlog, .bin)",
+    )
+    parser.add_argument(
+        "--positions", type=Path, metavar="FILE", help="with a log: better positions, as `swath process` takes them"
+    )
+    parser.add_argument(
+        "--geoid", metavar="M|GRID", help="with --positions: height of the geoid, if their heights are another kind"
+    )
     parser.add_argument("--crs", "--epsg", metavar="EPSG", help="projected CRS; default: the cloud's, or a UTM zone")
     parser.add_argument(
         "--hybrid", choices=("gained", "true"), default="gained",
@@ -74,6 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{logs[1]}: a second log; expected one")
     if logs and arguments.trajectory is not None:
         raise UsageError(f"--trajectory and {logs[0]}: one of the two")
+    if arguments.positions is not None and not logs:
+        raise UsageError("--positions: nothing uses it without a flight log")
     if not images and arguments.image_points is None:
         raise UsageError("IMAGES are missing; expected swath images [LOG] IMAGES... -o DIR, or --image-points")
     if arguments.image_points is not None and arguments.marks is not None:
@@ -81,10 +95,13 @@ def run(arguments: argparse.Namespace) -> int:
     expect([arguments.cloud], CLOUD, CLOUD_WORDS)
     expect([arguments.control, arguments.image_points, arguments.marks, arguments.start], TABLE, "a table (CSV)")
     claim_folder(arguments.output, results.FILES, arguments.force)
+    geoid: float | str | None = arguments.geoid
+    with contextlib.suppress(ValueError, TypeError):
+        geoid = float(arguments.geoid)
     task = work.Task(
         arguments.output, images, logs[0] if logs else None, arguments.trajectory, arguments.rig, arguments.cloud,
         arguments.control, arguments.image_points, arguments.marks, arguments.start, arguments.times, arguments.crs,
-        arguments.hybrid, arguments.hybrid_every,
+        arguments.positions, geoid, arguments.hybrid, arguments.hybrid_every,
     )  # fmt: skip
     with tqdm(unit="", leave=False, disable=not sys.stderr.isatty()) as bar:
 

@@ -16,15 +16,17 @@ from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory
 
 
-def trajectory_of(log: Path, told: Callable[[str, int], None]) -> Trajectory:
-    """Estimate it.
+def trajectory_of(
+    log: Path, positions: Path | None, geoid: float | str | None, told: Callable[[str, int], None]
+) -> Trajectory:
+    """Estimate it, with better positions and the geoid between their heights and the log's where they are given.
 
     Raises
     ------
     SwathError
         The log cannot be read, or does not hold what the smoother needs.
     """
-    survey = Survey(method="filtered")
+    survey = Survey(method="filtered", positions=None if positions is None else str(positions), geoid=geoid)
     with contextlib.ExitStack() as stack:
         readers = in_order_of_one_flight([stack.enter_context(LogReader(log))], None)
         flight = read_flight(readers, "ins", functools.partial(told, "read"))

@@ -8,12 +8,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flightlog.errors import CoverageError, UsageError
+from flightlog.errors import CaptureError, CoverageError, UsageError
 from groundproc.cloud import reader
 from groundproc.geodesy import utm_epsg
 from groundproc.imagery import assembly, flown, located
 from groundproc.imagery.assembly import Known
 from groundproc.imagery.exifrig import rig_of
+from groundproc.imagery.exposures import exposures_of
 from groundproc.imagery.imports import load_rig
 from groundproc.imagery.logged import trajectory_of
 from groundproc.imagery.measurements import rows_of
@@ -22,7 +23,7 @@ from groundproc.imagery.poses import NO_TIME, ImagePoses, read_poses
 from groundproc.imagery.rig import Rig
 from groundproc.imagery.site import Site, cartesian, georeferenced, in_frame
 from groundproc.imagery.tables import Control, Marks, read_control, read_marks
-from groundproc.imagery.times import times_of
+from groundproc.imagery.times import Timed, by_camera, times_of
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -44,6 +45,8 @@ class Task:
         Pictures and folders of them.
     log, trajectory, rig, cloud, control, image_points, marks, start, times : Path, optional
     crs : str, optional
+    positions, geoid : Path; float or str; optional
+        Better positions for the trajectory of the log, and how their heights become the log's.
     hybrid : str
         What is handed back to the smoother: "gained" or "true" (`hybrid`).
     every_s : float
@@ -62,6 +65,8 @@ class Task:
     start: Path | None = None
     times: Path | None = None
     crs: str | None = None
+    positions: Path | None = None
+    geoid: float | str | None = None
     hybrid: str = "gained"
     every_s: float = 0.0
 
@@ -85,6 +90,8 @@ class Session:
     start : ImagePoses, optional
     trajectory : Trajectory, optional
     site : Site
+    timed : Timed, optional
+        By which events times were found.
     lasting : tuple of float or ndarray
         What variances of the trajectory's places and turns are multiplied by, because its errors last.
     warnings : list of str
@@ -102,6 +109,7 @@ class Session:
     start: ImagePoses | None = None
     trajectory: Trajectory | None = None
     site: Site = field(default_factory=lambda: cartesian(np.zeros((1, 3))))
+    timed: Timed | None = None
     lasting: tuple[Array | float, Array | float] = (1.0, 1.0)
     warnings: list[str] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
@@ -196,17 +204,16 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
         rows = rows_of(session.start.images, session.names)
         at = np.array([rows.get(name, -1) for name in session.names])
         session.time_ns = np.where(at >= 0, session.start.utc_ns[at], NO_TIME)
-    if task.times is not None:
-        session.time_ns, note = times_of(task.times, session.names, session.time_ns)
-        if "by name" not in note:
-            session.warnings.append(note) if "intervals" in note else None
+    timed = _noted_times(session, task)
+    if timed is not None:
+        _take(session, timed)
     if task.log is not None:
-        session.trajectory = trajectory_of(task.log, progress)
+        session.trajectory = trajectory_of(task.log, task.positions, task.geoid, progress)
     elif task.trajectory is not None:
         session.trajectory = flown.load_trajectory(task.trajectory)
     if session.trajectory is None:
         return
-    if task.times is None:
+    if timed is None:
         offset_ns = flown.whole_offset_ns(session.trajectory, session.time_ns)
         if offset_ns:
             hours = -offset_ns / 3.6e12
@@ -214,6 +221,33 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
             session.time_ns = np.where(session.time_ns == NO_TIME, NO_TIME, session.time_ns + offset_ns)
     session.keep(session.time_ns != NO_TIME, "has no time (EXIF, --times), and so no place on the trajectory")
     session.rig = with_sigmas(session.rig)
+
+
+def _noted_times(session: Session, task: Task) -> Timed | None:
+    """Times of `--times`, else what the log noted of exposures; None: the images' own clocks."""
+    if task.times is not None:
+        return times_of(task.times, session.names, session.time_ns, session.camera)
+    if task.log is None or not session.pictures:
+        return None
+    noted = exposures_of(task.log)
+    if noted is None:
+        return None
+    try:
+        return by_camera(noted, session.time_ns, session.camera, task.log.name)
+    except CaptureError as error:
+        session.warnings.append(f"{error}; the images' own clocks are used")
+        return None
+
+
+def _take(session: Session, timed: Timed) -> None:
+    """Times found, and what is to be said of them."""
+    session.time_ns = timed.utc_ns
+    session.timed = timed
+    if "intervals" in timed.note:
+        session.warnings.append(timed.note)
+    if timed.own.any():
+        named = [name for name, own in zip(session.names, timed.own.tolist(), strict=True) if own]
+        session.warnings.append(f"images without an event, placed by their own clock: {names_listed(named)}")
 
 
 def with_sigmas(rig: Rig) -> Rig:

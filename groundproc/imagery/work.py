@@ -174,6 +174,7 @@ def _finish(
     shift = np.array([round(one.timeshift_s * 1e9) for one in block.rig.cameras])[block.camera]
     utc_ns = np.where(stamps == NO_TIME, NO_TIME, stamps + shift)
     told = results.figures(adjusted, session.site, measured.names, session.control) | more
+    told |= _origins(session)
     session.warnings += _doubts(told, session, measured)
     told["left_out"] = session.left_out
     told["warnings"] = session.warnings
@@ -183,6 +184,22 @@ def _finish(
     results.write_all(task.output, adjusted, session.site, poses, measured.names, told)
     if session.trajectory is not None:
         _hand_back(task, session.trajectory, adjusted)
+    return told
+
+
+def _origins(session: Session) -> dict[str, Any]:
+    """Where pictures are, and by what they have times."""
+    told: dict[str, Any] = {"images_folder": None, "times": None}
+    if session.pictures:
+        one = session.pictures[0]
+        told["images_folder"] = str(one.path.absolute()).removesuffix(one.name)
+    if session.timed is not None:
+        offset_s = session.timed.offset_s
+        told["times"] = {
+            "note": session.timed.note,
+            "utc_minus_exif_s": offset_s if np.isfinite(offset_s) else None,
+            "by_own_clock": int(session.timed.own.sum()),
+        }
     return told
 
 
