@@ -56,7 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
         for sentence in outcome.said:
             print(f"  {outcome.name}: {sentence}", file=sys.stderr, flush=True)
     ordered = [found[job.name] for job in jobs]
-    print(json.dumps([asdict(each) for each in ordered], indent=2) if arguments.json else _table(ordered))
+    if arguments.json:
+        print(json.dumps([asdict(each) for each in ordered], indent=2))
+    else:
+        _show(ordered)
     return _exit_code(ordered)
 
 
@@ -69,17 +72,16 @@ def _line(outcome: Outcome) -> str:
     return f"{outcome.name}: {outcome.verdict}, {outcome.points:,} points, {state}"
 
 
-def _table(found: Sequence[Outcome]) -> str:
+def _show(found: Sequence[Outcome]) -> None:
     """A line a flight, and the sum."""
-    width = max(len("flight"), *(len(each.name) for each in found))
-    rows = [f"{'flight':<{width}}  {'verdict':<9}{'points':>14}{'seconds':>9}  products"]
-    rows += [
-        f"{each.name:<{width}}  {each.verdict:<9}{each.points:>14,}{each.seconds:>9.0f}  {each.output}"
-        for each in found
-    ]
+    from groundproc import screen
+
+    screen.table(
+        ["flight", "verdict", "points", "seconds", "products"],
+        [[each.name, each.verdict, f"{each.points:,}", f"{each.seconds:.0f}", each.output] for each in found],
+    )
     failed = sum(each.verdict == "failed" for each in found)
-    rows.append(f"{len(found)} flights, {failed} failed, {sum(each.points for each in found):,} points")
-    return "\n".join(rows)
+    print(f"{len(found)} flights, {failed} failed, {sum(each.points for each in found):,} points")
 
 
 def _exit_code(found: Sequence[Outcome]) -> int:

@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read each log once and print its figures and its verdict; one that cannot be read does not keep the others from being told."""
     from flightlog.errors import SwathError
+    from groundproc import screen
     from groundproc.flight.summary.text import as_text
 
     told: list[dict[str, Any]] = []
@@ -45,7 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.json:
             print(*lines, sep="\n", end="\n" if lines else "", file=sys.stderr)
         else:
-            print(("\n" if len(told) > 1 else "") + "\n\n".join([as_text(summary), *lines]))
+            print(("\n" if len(told) > 1 else "") + as_text(summary))
+            if verdict is not None:
+                print(flush=True)
+                screen.verdict(verdict.line(), verdict.grade)
     if arguments.json:
         print(json.dumps(told[0] if len(arguments.logs) == 1 else told, indent=2))
     return max(codes, key=_WORSE.index)

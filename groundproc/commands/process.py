@@ -42,7 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a trajectory made before: a folder of `swath process`, whose mount, lasers and clocks are used too, or a trajectory.csv",
     )
     parser.add_argument("--until", choices=ORDER, metavar="STEP", help=f"stop after this step: {', '.join(ORDER)}")
-    parser.add_argument("--status", action="store_true", help="say what is there and what is to be done, and why")
+    parser.add_argument(
+        "--status",
+        "--dry-run",
+        action="store_true",
+        help="say what is there and what is to be done, and why; do nothing",
+    )
     parser.add_argument("--force", action="store_true", help="do every step again, and write over files that are there")
     parser.add_argument("--json", action="store_true", help="print what quality.json holds")
 
@@ -89,10 +94,15 @@ def _tell_uses(folder: Path, as_json: bool) -> None:
 
 def _tell(quality: dict[str, Any], folder: Path, as_json: bool) -> int:
     """Print what came of it: figures, every warning, and the verdict as the last line; give its exit code."""
+    from groundproc import screen
     from groundproc.verdict import Verdict, warnings_in
 
     verdict = Verdict.from_mapping(quality)
-    print(json.dumps(quality, indent=2) if as_json else _report(quality, folder), flush=True)
+    if as_json:
+        print(json.dumps(quality, indent=2), flush=True)
+    else:
+        screen.summary(_report(quality, folder))
+        sys.stdout.flush()
     of_positions = [leg["positions"]["note"] for leg in quality["legs"] if leg["positions"]]
     for note in dict.fromkeys(quality["autopilot"]["notes"] + of_positions):
         if note:
@@ -100,7 +110,10 @@ def _tell(quality: dict[str, Any], folder: Path, as_json: bool) -> int:
     for warning in warnings_in(quality):
         print(f"swath: warning: {warning}", file=sys.stderr, flush=True)
     # with --json the verdict is the object's first key, and the object stays the only thing on standard output
-    print(verdict.line(), file=sys.stderr if as_json else sys.stdout)
+    if as_json:
+        print(verdict.line(), file=sys.stderr)
+    else:
+        screen.verdict(verdict.line(), verdict.grade)
     return verdict.exit_code
 
 
@@ -200,25 +213,31 @@ def _print_states(found: Sequence[State], folder: Path, as_json: bool) -> None:
             print(f"{'':<{width + 9}}{', '.join(state.outputs)}")
 
 
-def _report(quality: dict[str, Any], folder: Path) -> str:
-    """A few lines for the terminal."""
+def _report(quality: dict[str, Any], folder: Path) -> list[tuple[str, str]]:
+    """A few lines for the terminal, each with what it is about."""
     sync, points, track = quality["sync"], quality["points"], quality["trajectory"]
     crs, height = quality["crs"], quality["height"]
     east, north, up = track["median_sigma_m"]
     lines = [
-        f"{points['written']:,} points in EPSG:{crs['epsg']} ({crs['name']}), heights {height['meaning']}",
-        *_left_out(points.get("left_out", {})),
-        f"trajectory by {track['method']}: {track['covered_s']:.1f} s from {track['start']}, "
-        f"sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)"
-        + (f"; {track['note']}" if track["note"] else ""),
-        f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
-        + (f"; {sync['note']}" if sync["note"] else ""),
-        *dict.fromkeys(f"UTC: {said}" for leg in quality["legs"] for said in leg["utc"]["mended"]),
-        *_control_lines(quality.get(track["method"], {}).get("control")),
-        _mount_line(quality["mount"]),
-        *_where(folder),
+        ("points", f"{points['written']:,} points in EPSG:{crs['epsg']} ({crs['name']}), heights {height['meaning']}"),
+        *(("", line) for line in _left_out(points.get("left_out", {}))),
+        (
+            "trajectory",
+            f"trajectory by {track['method']}: {track['covered_s']:.1f} s from {track['start']}, "
+            f"sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)"
+            + (f"; {track['note']}" if track["note"] else ""),
+        ),
+        (
+            "clocks",
+            f"sync by {sync['method']}: autopilot = lidar {sync['offset_s']:+.6f} s, sigma {sync['sigma_s'] * 1e3:.2f} ms"
+            + (f"; {sync['note']}" if sync["note"] else ""),
+        ),
     ]
-    return "\n".join(lines)
+    mended = dict.fromkeys(f"UTC: {said}" for leg in quality["legs"] for said in leg["utc"]["mended"])
+    lines += [("", line) for line in mended]
+    lines += [("control", line) for line in _control_lines(quality.get(track["method"], {}).get("control"))]
+    lines += [("mount", _mount_line(quality["mount"]))]
+    return lines + [("products", line) for line in _where(folder)]
 
 
 def _left_out(counts: dict[str, int]) -> list[str]:

@@ -3,6 +3,10 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from groundproc.field.pull import Vehicle
 
 HELP = "bring the flight logs of an aircraft here, verified"
 
@@ -20,6 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ssh-config", type=Path, metavar="FILE", help="configuration for ssh")
     parser.add_argument(
         "--anyway", action="store_true", help="go on where it is not known whether the aircraft is armed"
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="list what is there and what would be brought; do nothing"
     )
 
 
@@ -39,6 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
             "on Windows within WSL"
         )
     vehicle = Vehicle(arguments.host, arguments.port, arguments.identity, arguments.ssh_config)
+    if arguments.dry_run:
+        return _list(vehicle, arguments.output)
 
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr)
@@ -56,3 +65,23 @@ def run(arguments: argparse.Namespace) -> int:
         f"{outcome.acknowledged} newly acknowledged, {len(outcome.troubles)} failed"
     )
     return int(bool(outcome.troubles))
+
+
+def _list(vehicle: "Vehicle", folder: Path) -> int:
+    """What is on the aircraft, and whether it is here already; asks for its manifest, and for nothing else."""
+    from groundproc import screen
+    from groundproc.field.pull import segments
+
+    there = segments(vehicle)
+    here = {
+        each.name
+        for each in there
+        if (folder / each.name).is_file() and (folder / each.name).stat().st_size == each.size
+    }
+    screen.table(
+        ["log", "MB", "state"],
+        [[each.name, f"{each.size / 1e6:.1f}", "here" if each.name in here else "to bring"] for each in there],
+    )
+    wanted = [each for each in there if each.name not in here]
+    print(f"{len(wanted)} to bring ({sum(each.size for each in wanted) / 1e6:.1f} MB), {len(here)} here already")
+    return 0

@@ -30,6 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.errors import UsageError
+    from groundproc import screen
     from groundproc.analysis import volumes
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
@@ -68,8 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
         }
         with written_aside(arguments.json) as aside:
             aside.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-    print(f"{'polygon':<14}{'cut [m3]':>12}{'fill [m3]':>12}{'net [m3]':>12}{'sigma [m3]':>12}{'area [m2]':>12}")
-    for row in rows:
-        values = (row[name] for name in ("cut_m3", "fill_m3", "net_m3", "sigma_m3", "area_m2"))
-        print(f"{row['id'][:14]:<14}" + "".join(f"{value:>12.2f}" for value in values))
+    columns = ("cut_m3", "fill_m3", "net_m3", "sigma_m3", "area_m2")
+    screen.table(
+        ["polygon", "cut [m3]", "fill [m3]", "net [m3]", "sigma [m3]", "area [m2]"],
+        [[row["id"], *(f"{row[name]:.2f}" for name in columns)] for row in rows],
+    )
     return 0

@@ -37,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     import math
 
     from flightlog.errors import UsageError
+    from groundproc import screen
     from groundproc.analysis.wires import Task, work
     from groundproc.commands.figures import claim_json, points_bar, warn, write_json
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
@@ -56,13 +57,12 @@ def run(arguments: argparse.Namespace) -> int:
     write_json(arguments, figures)
     warn(made.warnings, sys.stderr)
     if made.wires:
-        print(f"{'wire':<12}{'length [m]':>12}{'sag [m]':>10}{'to ground [m]':>15}{'to growth [m]':>15}")
-    for each in figures["wires"]:
-        near = [each["clearance_ground_m"], each["clearance_vegetation_m"]]
-        told = "".join(f"{'-' if value is None else format(value, '.2f'):>15}" for value in near)
-        print(
-            f"{each['kind']} {each['number']:<{11 - len(each['kind'])}}{each['length_m']:>12.2f}{each['sag_m']:>10.2f}{told}"
-        )
+        rows = []
+        for each in figures["wires"]:
+            values = [each[name] for name in ("length_m", "sag_m", "clearance_ground_m", "clearance_vegetation_m")]
+            told = ["-" if value is None else f"{value:.2f}" for value in values]
+            rows.append([f"{each['kind']} {each['number']}", *told])
+        screen.table(["wire", "length [m]", "sag [m]", "to ground [m]", "to growth [m]"], rows)
     print(
         f"{len(made.wires)} wires, {figures['poles']} poles, {figures['masts']} masts, {figures['stays']} stays, "
         f"{figures['fences']} fences in {arguments.output}"
