@@ -149,6 +149,20 @@ def test_closed_segments_come_verified_and_are_acknowledged(aircraft: Aircraft, 
     assert aircraft.acknowledged == ["00001-000.mcap", "00002-000.mcap"]
 
 
+def test_a_dry_run_lists_and_brings_nothing(
+    aircraft: Aircraft, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    aircraft.record("00001-000.mcap", 1_500_000, 1)
+    aircraft.record("00001-001.mcap", 12345, 2)
+    aircraft.say_health(True)  # to look is allowed in the air
+    assert aircraft.pull(tmp_path / "new", "--dry-run") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[1].split() == ["00001-000.mcap", "1.5", "to", "bring"]
+    assert said[-1] == "2 to bring (1.5 MB), 0 here already"
+    assert not (tmp_path / "new").exists()
+    assert aircraft.acknowledged == []
+
+
 def test_a_second_pull_brings_what_is_new_only(
     aircraft: Aircraft, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
