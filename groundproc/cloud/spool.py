@@ -2,6 +2,7 @@
 
 import tempfile
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,17 +62,20 @@ class Spool:
 
     def take(self, place: Place) -> Records:
         """All records of a square, in the order in which they came; they are here no longer."""
-        parts = []
+        found = list(self.pieces(place))
+        return np.concatenate(found) if found else np.empty(0, self._dtype)
+
+    def pieces(self, place: Place) -> Iterator[Records]:
+        """All records of a square, piece by piece, in the order in which they came; they are here no longer."""
         for begin, size in self._pieces.pop(place, ()):
             self._file.seek(begin)
             raw = np.frombuffer(self._unpack.decompress(self._file.read(size)), np.uint8)
             # bytes of the same rank lie together, as they are compressed best
-            parts.append(np.ascontiguousarray(raw.reshape(self._dtype.itemsize, -1).T).view(self._dtype)[:, 0])
+            yield np.ascontiguousarray(raw.reshape(self._dtype.itemsize, -1).T).view(self._dtype)[:, 0]
         waiting = self._waiting.pop(place, [])
         self._bytes -= sum(each.nbytes for each in waiting)
         self.counts.pop(place, None)
-        found = parts + waiting
-        return np.concatenate(found) if found else np.empty(0, self._dtype)
+        yield from waiting
 
     def _write(self) -> None:
         """Write what waits; squares with few records wait on, unless that is all there is."""

@@ -43,6 +43,9 @@ REGISTRY: Final[dict[str, Entry]] = {
         "cloud_height.png (as a lit surface), cloud_intensity.png: from above and from the south, to scale",
     ),
     "cloud.copc.laz": Entry("groundproc.products.cloud_copc", "CloudCopc", "the same points as an octree, for viewers"),
+    "tiles": Entry(
+        "groundproc.products.tiles", "Tiles", "tiles/: the points in squares of 250 m, cloud.vpc opens them all", by_default=False
+    ),
     "dsm.tif": Entry("groundproc.products.dsm", "Dsm", "surface model: the highest point of each cell, 0.25 m"),
     "intensity.tif": Entry("groundproc.products.intensity", "Intensity", "mean intensity by cell"),
     "density.tif": Entry("groundproc.products.density", "Density", "points per square metre by cell"),

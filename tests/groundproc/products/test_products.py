@@ -225,3 +225,13 @@ def test_choosing_all_products_imports_nothing_that_only_drawing_needs() -> None
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert "groundproc.products.adjustment_plot" in done.stdout.split()
     assert "matplotlib" not in done.stdout
+
+
+def test_tiles_hold_the_points_of_the_cloud(context: Context) -> None:
+    make(["cloud.laz", {"tiles": {"size_m": 20, "format": "laz"}}], context)
+    whole = laspy.read(context.folder / "cloud.laz")
+    tiles = [laspy.read(path) for path in (context.folder / "tiles").glob("*_*.laz")]
+    assert sum(len(each.points) for each in tiles) == len(whole.points)
+    found = np.concatenate([each.xyz for each in tiles])
+    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(whole.xyz, axis=0), rtol=0, atol=1e-9)
+    assert (context.folder / "tiles" / "cloud.vpc").is_file()
