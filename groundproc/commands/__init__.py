@@ -11,7 +11,7 @@ CHAPTERS: Final = {
     "recordings": ("pull", "info", "import", "recover", "replay", "bag"),
     "from flight to cloud": ("init", "process", "batch", "live", "report", "view", "decode"),
     "trajectory and calibration": ("calibrate", "compass", "ppk", "adjust", "verify-sensor"),
-    "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse", "merge"),
+    "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse", "merge", "tile"),
     "what people fly for": (
         "ground", "trees", "wires", "detect", "change", "viewshed", "passability", "reflectance", "orthophoto",
     ),

@@ -18,7 +18,8 @@ READ_ON: Final = {
     "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
     "pull": "install.md#get-the-logs-swath-pull", "raster": "clouds.md", "recover": "aircraft.md#flight-logs",
     "reflectance": "uses/reflectance.md", "replay": "tutorial.md", "report": "report.md", "section": "uses/section.md",
-    "simulate": "simulator.md", "tin": "clouds.md#triangles-for-design-and-machine-control", "trees": "uses/trees.md",
+    "simulate": "simulator.md", "tile": "clouds.md#tiles", "tin": "clouds.md#triangles-for-design-and-machine-control",
+    "trees": "uses/trees.md",
     "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
     "warmup": "install.md#on-the-ground-compile-once", "wires": "uses/wires.md",
 }  # fmt: skip
