@@ -103,7 +103,7 @@ def instants(images: Sequence[Image], utc_ns: Sequence[int], within_s: float) ->
 def wide_of(block: Block, found: Sequence[Instant]) -> Wide:
     """The camera that stands for the rig: looks where its cameras look in the mean, and sees all that they see, as finely as the finest.
 
-    Its x axis is that of the first camera; how the cameras stand to each other is the mean of all instants.
+    Its x axis is the mean of theirs; how the cameras stand to each other is the mean of all instants.
     """
     whole = max(found, key=lambda each: len(each.images))
     base = min(image.camera for image in whole.images)
@@ -120,7 +120,10 @@ def wide_of(block: Block, found: Sequence[Instant]) -> Wide:
     off = [np.linalg.norm(one - mean[camera]) ** 2 / 2.0 for camera, each in turns.items() for one in each]
     axis = np.sum([mat[:, 2] for mat in mean.values()], axis=0)
     axis /= np.linalg.norm(axis)
-    right = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
+    right = np.sum([mat[:, 0] for mat in mean.values()], axis=0)
+    if np.linalg.norm(right) < 0.5 * len(mean):  # they are turned about their axes: as the first one
+        right = np.array([1.0, 0.0, 0.0])
+    right -= (right @ axis) * axis
     right /= np.linalg.norm(right)
     mat_wide_base = np.stack([right, np.cross(axis, right), axis])
     middle = np.mean([np.mean(each, axis=0) for each in arms.values()], axis=0)
@@ -225,7 +228,8 @@ def _ranges(block: Block, scene: Scene, camera: Camera, own: Image) -> Raster:
     nearest = found[0].nearest
     empty = ~np.isfinite(nearest)
     _, places = ndimage.distance_transform_edt(empty, return_indices=True)
-    return np.asarray(nearest[tuple(places)])
+    # through a gap between points single pixels show what is behind
+    return np.asarray(ndimage.median_filter(nearest[tuple(places)], 3))
 
 
 def _points(camera: Camera, rows: Any, columns: Any, pose: tuple[Array, Array], ranges: Raster) -> Array:
