@@ -2,7 +2,8 @@
 
 import contextlib
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from flightlog.errors import SourceError, SwathError
@@ -46,6 +47,41 @@ def removed(path: Path) -> Iterator[Path]:
         yield path
     finally:
         path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def written_folder(folder: Path, last: str, before: Collection[str] = ()) -> Iterator[Path]:
+    """Give a folder beside `folder` to write into; on leaving its files go there, on an error nothing does.
+
+    Parameters
+    ----------
+    folder : Path
+    last : str
+        The file that names the others: it comes last.
+    before : collection of str
+        Files of the folder that go where they are not written anew.
+
+    Raises
+    ------
+    SourceError
+        The place cannot be written to.
+    """
+    aside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    try:
+        aside.mkdir(parents=True)
+        yield aside
+        folder.mkdir(parents=True, exist_ok=True)
+        made = sorted(aside.iterdir(), key=lambda path: path.name == last)
+        for path in made:
+            path.replace(folder / path.name)
+        for name in set(before) - {path.name for path in made}:
+            (folder / name).unlink(missing_ok=True)
+    except SwathError as error:
+        raise type(error)(str(error).replace(str(aside), str(folder))) from None
+    except OSError as error:
+        raise SourceError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -1,17 +1,16 @@
 """From cloud files to a folder of tiles: written beside it and moved there when all is whole."""
 
 import json
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flightlog.errors import SourceError, SwathError, UsageError
+from flightlog.errors import UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.layout import Layout
 from groundproc.cloud.reader import Cloud
 from groundproc.cloud.tiling import INDEX, Tile, Tiling
 from groundproc.cloud.vpc import write_vpc
+from groundproc.files import written_folder
 
 
 def tile_clouds(
@@ -37,9 +36,7 @@ def tile_clouds(
         A cloud cannot be read, or a tile cannot be written.
     """
     _claim(folder, force, [cloud.path for cloud in clouds])
-    aside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    try:
-        aside.mkdir(parents=True)
+    with written_folder(folder, INDEX, _named(folder / INDEX)) as aside:
         layout = Layout(clouds)
         header = layout.header()
         tiling = Tiling(header, aside, size_m)
@@ -49,13 +46,6 @@ def tile_clouds(
                 progress(len(chunk.record))
         tiles, overview = tiling.write(aside, form, progress)
         write_vpc(aside / INDEX, tiles, overview, header, clouds[0].crs)
-        _moved(aside, folder)
-    except SwathError as error:
-        raise type(error)(str(error).replace(str(aside), str(folder))) from None
-    except OSError as error:
-        raise SourceError(f"{folder}: cannot be written ({error.strerror or error})") from None
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     return tiles
 
 
@@ -71,17 +61,6 @@ def _claim(folder: Path, force: bool, inputs: Sequence[Path]) -> None:
     for path in inputs:
         if path.resolve() in mine:
             raise UsageError(f"{path}: is a tile of {folder}, which is to be written anew; give another folder")
-
-
-def _moved(aside: Path, folder: Path) -> None:
-    """Bring what is whole to its place; the index comes last, and what the one before named and is not written anew goes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    before = _named(folder / INDEX)
-    made = sorted((each for each in aside.iterdir()), key=lambda path: path.name == INDEX)
-    for path in made:
-        path.replace(folder / path.name)
-    for name in before - {path.name for path in made}:
-        (folder / name).unlink(missing_ok=True)
 
 
 def _named(index: Path) -> set[str]:

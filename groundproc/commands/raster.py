@@ -17,15 +17,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--what", default="dsm", metavar="NAME",
-        help="dsm, intensity, density, hillshade, local-relief, sky-view, or any attribute of the points; default: dsm",
+        help="dsm, intensity, density, sigma, strip-difference, hillshade, local-relief, sky-view, or any attribute of the points; "
+        "default: dsm",
     )  # fmt: skip
     parser.add_argument(
         "--statistic", metavar="NAME", help="max, min, mean, median, sigma or count of the values in a cell; default: max of "
         "heights, mean of others",
     )  # fmt: skip
-    parser.add_argument("--cell", type=float, default=0.25, metavar="M", help="size of a cell [m]; default: 0.25")
+    parser.add_argument(
+        "--cell", type=float, metavar="M", help="size of a cell [m]; default: 0.25, of strip-difference 0.5"
+    )
+    parser.add_argument(
+        "--tiles", type=float, metavar="M", help="side of tiles [m]: -o is a folder then, with an index (.vrt)"
+    )
+    parser.add_argument(
+        "--all-classes", action="store_true", help="noise and what moves (classes 7, 18 and 64) count too"
+    )
     parser.add_argument("--crs", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the raster, .tif")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="the raster, .tif; with --tiles a folder"
+    )
     add_force(parser)
 
 
@@ -38,15 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.raster.work import SUFFIXES, Task, work
 
     expect(arguments.clouds, (*CLOUD, *RASTER), CLOUD_WORDS)
-    claim_file(arguments.output, SUFFIXES, arguments.force, arguments.clouds)
+    if arguments.tiles is None:
+        claim_file(arguments.output, SUFFIXES, arguments.force, arguments.clouds)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
-        made = work(
-            Task(
-                arguments.clouds, arguments.output, arguments.what, arguments.statistic, arguments.cell, arguments.crs
-            ),
-            bar.update,
+        task = Task(
+            arguments.clouds, arguments.output, arguments.what, arguments.statistic, arguments.cell, arguments.crs,
+            arguments.all_classes, arguments.tiles, arguments.force,
         )  # fmt: skip
+        made = work(task, bar.update)
     for line in made.warnings:
         print(f"swath: warning: {line}", file=sys.stderr)
-    print(f"{made.columns} x {made.rows} cells of {made.cell_m:g} m in {arguments.output}")
+    left = f"; {made.left_out:,} points of classes 7, 18 and 64 left out" if made.left_out else ""
+    print(f"{made.columns} x {made.rows} cells of {made.cell_m:g} m in {arguments.output}{left}")
     return 0

@@ -50,6 +50,13 @@ REGISTRY: Final[dict[str, Entry]] = {
     "intensity.tif": Entry("groundproc.products.intensity", "Intensity", "mean intensity by cell"),
     "density.tif": Entry("groundproc.products.density", "Density", "points per square metre by cell"),
     "hillshade.tif": Entry("groundproc.products.hillshade", "Hillshade", "surface model lit from the north-west"),
+    "sigma.tif": Entry(
+        "groundproc.products.sigma", "Sigma", "how well the points of each cell are known, one sigma in space", by_default=False
+    ),
+    "strip_difference.tif": Entry(
+        "groundproc.products.strip_difference", "StripDifference", "by how much flight lines differ in height, cells of 0.5 m",
+        by_default=False,
+    ),
     "trajectory.gpkg": Entry("groundproc.products.trajectory_gpkg", "write", "the flown path as lines, for maps"),
     "trajectory.gpx": Entry(
         "groundproc.products.trajectory_maps", "write", "the flown path for phones and globes: trajectory.gpx and .kml", by_default=False

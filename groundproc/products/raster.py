@@ -5,9 +5,10 @@ from typing import ClassVar
 
 from flightlog.config import option
 from groundproc.cloud.points import Points
+from groundproc.cloud.selection import SURFACES, Selection
 from groundproc.products.product import Context
 from groundproc.raster.grid import SMALLEST_CELL_M
-from groundproc.raster.kinds import CELL_M, Gathering, kind
+from groundproc.raster.kinds import CELL_M, gathering, kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,9 +18,11 @@ class Options:
     Attributes
     ----------
     cell_m : float
+    all_classes : bool
     """
 
     cell_m: float = option(CELL_M, "size of a cell [m]; edges lie on whole multiples of it", minimum=SMALLEST_CELL_M)
+    all_classes: bool = option(False, "noise and what moves count too")
 
 
 class RasterProduct:
@@ -41,11 +44,12 @@ class RasterProduct:
         """Begin with no points."""
         self._crs, self._path = context.crs, context.aside(self.FILE)
         chosen = kind(self.KIND, getattr(self._options, "statistic", None))
-        self._gathering = Gathering(chosen, self._options.cell_m, context.folder)
+        self._gathering = gathering(chosen, self._options.cell_m, context.folder)
+        self._selection = Selection(() if self._options.all_classes else (SURFACES,))
 
     def add(self, points: Points) -> None:
         """Take points."""
-        self._gathering.add(points)
+        self._gathering.add(self._selection.of(points))
 
     def finish(self) -> None:
         """Write the file."""

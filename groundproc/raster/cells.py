@@ -53,8 +53,7 @@ class Cells:
             xyz_m, values = xyz_m[keep], values[keep]
         if not len(values):
             return
-        within, column, row = _cells(xyz_m, 1.0 / self.cell_m)
-        number, tiles = _numbered(column, row)
+        within, number, tiles = cells_of(xyz_m, self.cell_m)
         order, first = sorted_by(number, len(tiles))
         for each, place in enumerate(tiles):
             tile = self._tiles.get(place)
@@ -130,6 +129,15 @@ class Tile:
         full = self._count > 0 if len(self._count) else np.isfinite(self._low if len(self._low) else self._high)
         rows, columns = np.nonzero(full.reshape(SIDE, SIDE))
         return int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())
+
+
+def cells_of(
+    xyz_m: Array, cell_m: float
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int32], list[tuple[int, int]]]:
+    """Cell within its tile and number of the tile of each point, shape (n,) each, and the tiles: column and row counted in tiles."""
+    within, column, row = _cells(xyz_m, 1.0 / cell_m)
+    number, tiles = _numbered(column, row)
+    return within, number, tiles
 
 
 def _numbered(

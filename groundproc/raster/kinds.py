@@ -12,10 +12,10 @@ import pyproj
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud.dimensions import TABLE
 from groundproc.cloud.points import Points
-from groundproc.raster import geotiff, relief
+from groundproc.raster import geotiff, linedifference, relief
 from groundproc.raster.cells import STATISTICS, Cells
 from groundproc.raster.geotiff import Band
-from groundproc.raster.grid import Window, checked_cell
+from groundproc.raster.grid import Grid, Window, checked_cell
 from groundproc.raster.medians import Medians
 
 Values = npt.NDArray[Any]
@@ -59,6 +59,14 @@ class Kind:
         The statistic is divided by the area of a cell.
     derived : Derived, optional
         What is made of the gathered heights.
+    made_of : tuple of str
+        The attributes that the value of a point follows from, where it is none by itself.
+    value : callable, optional
+        The value of points, of these.
+    by_line : bool
+        Flight lines are told apart: see `linedifference`.
+    cell_m : float
+        Size of a cell where nothing else is asked for.
     """
 
     name: str
@@ -68,6 +76,10 @@ class Kind:
     band: Band
     per_area: bool = False
     derived: Derived | None = None
+    made_of: tuple[str, ...] = ()
+    value: Callable[[Points], Values] | None = None
+    by_line: bool = False
+    cell_m: float = CELL_M
 
     def values(self, points: Points) -> Values:
         """The value of each point.
@@ -77,7 +89,15 @@ class Kind:
         UsageError
             The points do not have that attribute.
         """
+        if self.value is not None:
+            return self.value(points)
         return points.xyz_m[:, 2] if self.column == "z" else points[self.column]
+
+
+def _sigma(points: Points) -> Values:
+    """How well the place of each point is known, one sigma of the way to where it is: both horizontal axes and the height."""
+    sigma_h, sigma_v = points["sigma_h"], points["sigma_v"]
+    return np.sqrt(2.0 * sigma_h.astype(np.float64) ** 2 + sigma_v.astype(np.float64) ** 2)
 
 
 def _shade(height_m: npt.NDArray[np.float32], cell_m: float) -> npt.NDArray[Any]:
@@ -92,6 +112,17 @@ def _local(height_m: npt.NDArray[np.float32], cell_m: float) -> npt.NDArray[Any]
 
 def _sky(height_m: npt.NDArray[np.float32], cell_m: float) -> npt.NDArray[Any]:
     return relief.sky_view(relief.filled(height_m, max(round(GAP_M / cell_m), 1)), cell_m, SKY_RADIUS_M)
+
+
+def _tied(statistic: str | None, name: str) -> None:
+    """Refuse a statistic of what has none.
+
+    Raises
+    ------
+    UsageError
+    """
+    if statistic is not None:
+        raise UsageError(f"{name} with statistic {statistic}: it compares flight lines and has none")
 
 
 LOCAL_RADIUS_M: Final = 5.0
@@ -113,6 +144,14 @@ KINDS: Final = (
         "sky-view", f"share of the sky that is seen, horizon within {SKY_RADIUS_M:g} m", "z", "min", Band("sky-view factor"),
         derived=Derived(_sky, GAP_M + SKY_RADIUS_M),
     ),
+    Kind(
+        "sigma", "how well points are known, one sigma in space", "sigma", "mean", Band("point sigma", "m"),
+        made_of=("sigma_h", "sigma_v"), value=_sigma,
+    ),
+    Kind(
+        "strip-difference", "height of the later flight line over the earlier, of the two that differ most", "z", "mean",
+        linedifference.BAND, made_of=(linedifference.LINE,), by_line=True, cell_m=linedifference.CELL_M,
+    ),
 )  # fmt: skip
 """The sorts with a name of their own; any attribute of points is one too."""
 
@@ -131,6 +170,8 @@ def kind(name: str, statistic: str | None = None) -> Kind:
         if attribute is None:
             raise UsageError(f"{name!r}: found, expected one of {', '.join(names())}")
         found = Kind(name, attribute.about, name, "mean", Band(attribute.brief, attribute.unit))
+    if found.by_line:
+        _tied(statistic, name)
     if statistic is None or statistic == found.statistic:
         return found
     if statistic not in ALL_STATISTICS:
@@ -178,15 +219,18 @@ class Gathering:
         self._points += len(points)
         self._cells.add(points.xyz_m, self._kind.values(points))
 
-    def write(self, path: Path, crs: pyproj.CRS | None) -> None:
-        """Write the raster.
+    @property
+    def band(self) -> Band:
+        """What the raster holds."""
+        return self._kind.band
+
+    def made(self, path: Path) -> tuple[Grid, Callable[[Window], npt.NDArray[Any]]]:
+        """The grid, and what gives its windows; `path` is named in errors.
 
         Raises
         ------
         CoverageError
             No point had a value, or a few lie far from all others.
-        SourceError
-            It cannot be written.
         """
         grid = self._cells.grid()
         if grid is None:
@@ -197,7 +241,20 @@ class Gathering:
                 f"{grid.columns * grid.rows:,} cells, nearly all empty; are some of the points strays? leave these out, or take larger "
                 "cells"
             )
-        geotiff.write(path, grid, crs, self._kind.band, self._block)
+        return grid, self._block
+
+    def write(self, path: Path, crs: pyproj.CRS | None) -> None:
+        """Write the raster.
+
+        Raises
+        ------
+        CoverageError
+            No point had a value, or a few lie far from all others.
+        SourceError
+            It cannot be written.
+        """
+        grid, block = self.made(path)
+        geotiff.write(path, grid, crs, self._kind.band, block)
 
     def _block(self, window: Window) -> npt.NDArray[Any]:
         chosen = self._kind
@@ -219,4 +276,14 @@ def derive(how: Derived, heights: Source, window: Window, cell_m: float) -> npt.
 
 def needed(kind: Kind) -> Collection[str]:
     """The attributes that a reader has to give."""
+    if kind.made_of:
+        return kind.made_of
     return () if kind.column == "z" else (kind.column,)
+
+
+Gathered = Gathering | linedifference.Gathering
+
+
+def gathering(kind: Kind, cell_m: float, folder: Path) -> Gathered:
+    """What gathers points for a raster of some kind."""
+    return linedifference.Gathering(cell_m, folder) if kind.by_line else Gathering(kind, cell_m, folder)

@@ -12,10 +12,11 @@ from flightlog.errors import UsageError
 from groundproc import geodesy
 from groundproc.cloud import reader
 from groundproc.cloud.sameness import agreed_crs
+from groundproc.cloud.selection import SURFACES, Selection
 from groundproc.files import written_aside
-from groundproc.raster import geotiff
+from groundproc.raster import geotiff, linedifference, tiles
 from groundproc.raster.grid import Window
-from groundproc.raster.kinds import Gathering, Kind, derive, kind, needed
+from groundproc.raster.kinds import Gathered, Kind, derive, gathering, kind, needed
 
 SUFFIXES: Final = (".tif", ".tiff")
 
@@ -31,17 +32,27 @@ class Task:
     output : Path
     what, statistic : str
         See `kinds.kind`.
-    cell_m : float
+    cell_m : float or None
+        None: as the kind has it.
     crs : str or None
         EPSG code in place of what the clouds state.
+    all_classes : bool
+        Noise and what moves count too.
+    tile_m : float or None
+        Side of tiles: `output` is a folder then.
+    force : bool
+        Write over what is in that folder.
     """
 
     inputs: Sequence[Path]
     output: Path
     what: str
     statistic: str | None
-    cell_m: float
+    cell_m: float | None = None
     crs: str | None = None
+    all_classes: bool = False
+    tile_m: float | None = None
+    force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +63,7 @@ class Made:
     rows: int
     cell_m: float
     warnings: tuple[str, ...]
+    left_out: int = 0
 
 
 def work(task: Task, progress: Callable[[int], object]) -> Made:
@@ -65,21 +77,41 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
     chosen = kind(task.what, task.statistic)
     if task.inputs[0].suffix.lower() in SUFFIXES:
         return _of_heights(task, chosen)
-    clouds = [reader.look(path) for path in task.inputs]
+    choices = () if task.all_classes else (SURFACES,)
+    clouds = [reader.look(path, *choices) for path in task.inputs]
     crs, warnings = common_crs(clouds, task.crs)
     for cloud in clouds:
         missing = [name for name in needed(chosen) if name not in cloud.columns]
         if missing:
             raise UsageError(f"{cloud.path}: has no {missing[0]}, but {', '.join(cloud.columns)}")
-    gathering = Gathering(chosen, task.cell_m, task.output.parent)
-    with written_aside(task.output) as aside:
-        for cloud in clouds:
-            for chunk in reader.chunks(cloud, columns=needed(chosen)):
-                gathering.add(chunk.points)
-                progress(len(chunk.points))
-        gathering.write(aside, crs)
-    with geotiff.opened(task.output) as made:
-        return Made(made.grid.columns, made.grid.rows, made.grid.cell_m, warnings)
+    if task.tile_m is not None:
+        with tiles.claimed(task.output, task.force) as aside:
+            gathered, left = _gathered(task, chosen, clouds, aside, progress)
+            grid = tiles.write(aside, chosen.name, gathered, crs, task.tile_m)
+    else:
+        with written_aside(task.output) as aside:
+            gathered, left = _gathered(task, chosen, clouds, task.output.parent, progress)
+            gathered.write(aside, crs)
+        with geotiff.opened(task.output) as made:
+            grid = made.grid
+    return Made(grid.columns, grid.rows, grid.cell_m, warnings, left)
+
+
+def _gathered(
+    task: Task, chosen: Kind, clouds: Sequence[reader.Cloud], folder: Path, progress: Callable[[int], object]
+) -> tuple[Gathered, int]:
+    """All points of the clouds that count, and how many do not."""
+    found = gathering(chosen, chosen.cell_m if task.cell_m is None else task.cell_m, folder)
+    left = 0
+    for cloud in clouds:
+        selection = Selection(cloud.choices)
+        for chunk in reader.chunks(cloud, columns=needed(chosen), selection=selection):
+            found.add(chunk.points)
+            progress(len(chunk.points))
+        left += sum(selection.left_out.values())
+    if isinstance(found, linedifference.Gathering):
+        found.expect_overlap(task.output)
+    return found, left
 
 
 def common_crs(clouds: Sequence[reader.Cloud], code: str | None) -> tuple[pyproj.CRS | None, tuple[str, ...]]:
@@ -100,6 +132,8 @@ def common_crs(clouds: Sequence[reader.Cloud], code: str | None) -> tuple[pyproj
 
 def _of_heights(task: Task, chosen: Kind) -> Made:
     """A raster that follows from the heights of another."""
+    if task.tile_m is not None:
+        raise UsageError(f"{task.inputs[0]}: is a raster; tiles are made of clouds")
     if chosen.derived is None or len(task.inputs) > 1:
         raise UsageError(
             f"{task.inputs[0]}: is a raster; hillshade, local-relief or sky-view can be made of one, with --what"

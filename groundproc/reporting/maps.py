@@ -26,7 +26,7 @@ _STOPS: Final = {
     "warm": ("15224f", "5b2a86", "b5367a", "ee6a50", "fdb863", "fdf5c9"),
     "sides": ("2166ac", "92c5de", "f2f2f0", "f4a582", "b2182b"),
 }
-_FIRST: Final = ("dsm.tif", "density.tif", "intensity.tif")
+_FIRST: Final = ("dsm.tif", "density.tif", "intensity.tif", "sigma.tif", "strip_difference.tif")
 _UNITS: Final = {"metre": "", "1/m2": "/m²"}
 """GDAL says "metre", of the heights of the CRS, where a band states no unit."""
 SHADE: Final = "hillshade.tif"
@@ -70,7 +70,7 @@ def layers_of(folder: Path, names: Sequence[str]) -> tuple[list[Layer], Layer | 
         (name for name in names if name.endswith((".tif", ".tiff")) and (folder / name).is_file()),
         key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name),
     )
-    layers = [_read(folder / name) for name in found]
+    layers = [each for each in map(_read, (folder / name for name in found)) if np.isfinite(each.values).any()]
     shade = next((each for each in layers if each.name == SHADE), None)
     return [each for each in layers if each.name != SHADE or len(layers) == 1], shade
 
