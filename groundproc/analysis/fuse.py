@@ -1,7 +1,7 @@
 """Clouds of other scanners and of photogrammetry merged into one, each laid on the first."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import GeodesyError
+from groundproc.analysis.placesearch import Found, search
 from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
 from groundproc.cloud.merger import Merger
@@ -19,14 +20,17 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Laid:
-    """A cloud and how it lies on the first; None: it is the first, or was left as it is."""
+    """A cloud and how it lies on the first; None: it is the first, or was left as it is. `place` is where a search put it."""
 
     path: Path
     points: int
     registration: Registration | None
+    place: Found | None = None
 
 
-def fuse(paths: Sequence[Path], output: Path, registered: bool, progress: Callable[[int], object]) -> list[Laid]:
+def fuse(
+    paths: Sequence[Path], output: Path, registered: bool, progress: Callable[[int], object], *, searched: bool = False
+) -> list[Laid]:
     """Merge clouds: the first as it is, the others moved onto it; `epoch` says which cloud a point is from.
 
     Parameters
@@ -37,13 +41,15 @@ def fuse(paths: Sequence[Path], output: Path, registered: bool, progress: Callab
         They lie on each other already: all points stay where they are.
     progress : callable
         Told of points done.
+    searched : bool
+        Place and heading of the others are not known: they are looked for.
 
     Raises
     ------
     GeodesyError
         They are in different CRS.
     CoverageError
-        One does not fit on the first.
+        One does not fit on the first, or at several places alike.
     """
     clouds = [reader.look(path) for path in paths]
     first = clouds[0]
@@ -57,8 +63,7 @@ def fuse(paths: Sequence[Path], output: Path, registered: bool, progress: Callab
     else:
         base = _sample(first, progress)
         for cloud in clouds[1:]:
-            what = f"{first.path} and {cloud.path}"
-            laid.append(Laid(cloud.path, cloud.points, register(base, _sample(cloud, progress), what)))
+            laid.append(_laid(cloud, base, _sample(cloud, progress), f"{first.path} and {cloud.path}", searched))
     with written_aside(output) as aside, Merger(clouds, aside, ("epoch",)) as merged:
         for number, (cloud, each) in enumerate(zip(clouds, laid, strict=True)):
             for chunk in reader.chunks(cloud, columns=()):
@@ -66,6 +71,15 @@ def fuse(paths: Sequence[Path], output: Path, registered: bool, progress: Callab
                 merged.write(chunk.record, {"epoch": np.full(len(chunk.points), number, np.uint8)}, moved)
                 progress(len(chunk.points))
     return laid
+
+
+def _laid(cloud: reader.Cloud, base: Array, sample: Array, what: str, searched: bool) -> Laid:
+    """A cloud laid on a sample of the first by one of itself."""
+    if not searched:
+        return Laid(cloud.path, cloud.points, register(base, sample, what))
+    place = search(base, sample, what)
+    fine = register(base, sample @ place.matrix[:3, :3].T + place.matrix[:3, 3], what)
+    return Laid(cloud.path, cloud.points, replace(fine, matrix=fine.matrix @ place.matrix), place)
 
 
 def _sample(cloud: reader.Cloud, progress: Callable[[int], object]) -> Array:
@@ -89,5 +103,7 @@ def told(laid: Sequence[Laid]) -> list[dict[str, Any]]:
                 "matrix": found.matrix.tolist(), "sigma_m": sigma[:3].tolist(), "sigma_deg": np.rad2deg(sigma[3:]).tolist(),
                 "residual_m": found.residual_m, "overlap": found.overlap, "fit": found.fit,
             }  # fmt: skip
+        if each.place is not None:
+            one |= {"correlation": each.place.correlation, "correlation_sigmas": each.place.sigmas}
         out.append(one)
     return out

@@ -22,8 +22,9 @@ from groundproc.analysis.terrain.holdout import HoldOut
 from groundproc.analysis.terrain.settings import Settings, settings_for
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.analysis.terrain.water import read_water
+from groundproc.cloud import classes as table
 from groundproc.cloud import reader
-from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED
+from groundproc.cloud.classes import BUILDING, GROUND, HIGH, HIGH_NOISE, LOW, LOW_NOISE, MEDIUM, UNCLASSIFIED, WATER
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -37,12 +38,7 @@ from groundproc.vectors.features import Features, write_features
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
-LOW, MEDIUM, HIGH, BUILDING, WATER = 3, 4, 5, 6, 9
-"""Classes of LAS 1.4 R15, table 17, beside those of the floor."""
-NAMES: Final = {
-    GROUND: "ground", LOW: "low vegetation", MEDIUM: "medium vegetation", HIGH: "high vegetation", BUILDING: "building",
-    LOW_NOISE: "low noise", WATER: "water", HIGH_NOISE: "high noise",
-}  # fmt: skip
+NAMES: Final = {kind: table.NAMES[kind] for kind in (GROUND, LOW, MEDIUM, HIGH, BUILDING, LOW_NOISE, WATER, HIGH_NOISE)}
 _LOW_M, _MEDIUM_M = 0.5, 2.0
 """Tops of low and of medium vegetation."""
 _GRASS_M: Final = 0.1

@@ -20,10 +20,11 @@ Array = npt.NDArray[np.float64]
 Sheet = npt.NDArray[np.float32]
 Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
 
-_CELLS: Final = 160
+_CELLS: Final = 96
 """Along the longer side of the larger cloud."""
-_LEAST_CELL_M: Final = 0.4
-_MOST_POINTS: Final = 150_000
+_LEAST_CELL_M: Final = 0.5
+_MOST_POINTS: Final = 100_000
+_COARSE_POINTS: Final = 40_000
 _SMOOTH_CELLS: Final = 6.0
 _CLIP_M: Final = 3.0
 """Higher relief counts as this: one mast is not the place."""
@@ -102,12 +103,12 @@ def search(a_m: Array, b_m: Array, what: str) -> Found:
     CoverageError
         Nowhere, or at several places alike.
     """
-    a, b = _thinned(a_m), _thinned(b_m)
+    a, b = _thinned(a_m, _MOST_POINTS), _thinned(b_m, _MOST_POINTS)
     about_a, about_b = a.mean(axis=0), b.mean(axis=0)
     a, b = a - about_a, b - about_b
     longest = max(np.ptp(each[:, axis]) for each in (a, b) for axis in (0, 1))
     cell_m = max(longest / _CELLS, _LEAST_CELL_M)
-    candidates = _coarse(a, b, cell_m)
+    candidates = _coarse(_thinned(a, _COARSE_POINTS), _thinned(b, _COARSE_POINTS), cell_m)
     if not candidates:
         raise CoverageError(
             f"{what}: too little relief to find one on the other; expected houses, trees or hollows on both"
@@ -134,8 +135,8 @@ def search(a_m: Array, b_m: Array, what: str) -> Found:
     return Found(best.turn_rad, shift, best.correlation, best.sigmas)
 
 
-def _thinned(xyz: Array) -> Array:
-    return np.asarray(xyz[:: max(1, -(-len(xyz) // _MOST_POINTS))], np.float64)
+def _thinned(xyz: Array, most: int) -> Array:
+    return np.asarray(xyz[:: max(1, -(-len(xyz) // most))], np.float64)
 
 
 def _turn(angle: float) -> Array:

@@ -24,7 +24,19 @@ from groundproc.analysis.corridor.strips import FENCE_HEIGHTS_M, fence, stay
 from groundproc.analysis.corridor.thin import RADIUS_M, thin_points
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
-from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED
+from groundproc.cloud.classes import (
+    CONDUCTOR,
+    FENCE,
+    GROUND,
+    GUARD,
+    HIGH_NOISE,
+    LOW_NOISE,
+    MAST,
+    POLE,
+    STAY,
+    TOWER,
+    UNCLASSIFIED,
+)  # fmt: skip
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Tiles, side_for
 from groundproc.files import written_aside
@@ -33,8 +45,6 @@ from groundproc.vectors.features import Features, write_features
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
-GUARD, CONDUCTOR, TOWER, MAST, POLE, FENCE, STAY = 13, 14, 15, 64, 65, 66, 67
-"""Classes: LAS 1.4 R15, table 17, and of the user."""
 _OLD_FORMATS: Final = 5
 _LAST_OLD_CLASS: Final = 31
 _ON_WIRE_M: Final = 0.3

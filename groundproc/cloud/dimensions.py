@@ -133,7 +133,7 @@ TABLE: Final = (
         "number_of_returns", "u1", "number of returns", "How many echoes of the shot there are.", "sensor", field="number_of_returns",
     ),
     Dimension(
-        "classification", "u1", "class", "ASPRS class; 0 is never classified, 64 is what moved (docs/attributes.md).", "attributes",
+        "classification", "u1", "class", "ASPRS class; 0 is never classified, from 64 on see docs/attributes.md#classes.", "attributes",
         field="classification",
     ),
     Dimension(
@@ -188,6 +188,13 @@ TABLE: Final = (
     ),
     Dimension(
         "views", "u1", "views", "Images that see the point, 255 at most; 0: it has no colour.", "`swath colour`",
+    ),
+    Dimension(
+        "spectral_class", "u1", "material by its spectrum", "Number of the material in the library of spectra, from 1; 0 is none of them.",
+        "`swath drape`",
+    ),
+    Dimension(
+        "spectral_angle", "f4", "angle of spectra", "Angle between the spectrum and that of the nearest material.", "`swath drape`", "deg",
     ),
     Dimension("hag", "f4", "height above ground", "Height above the terrain model.", "ground", "m"),
     Dimension("clearance", "f4", "to the nearest wire", "Distance to the nearest wire.", "wires", "m"),

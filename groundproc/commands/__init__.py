@@ -13,9 +13,9 @@ CHAPTERS: Final = {
     "trajectory and calibration": ("calibrate", "compass", "ppk", "adjust", "verify-sensor"),
     "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse", "merge", "tile"),
     "what people fly for": (
-        "ground", "trees", "wires", "detect", "change", "viewshed", "passability", "reflectance", "orthophoto",
+        "ground", "trees", "wires", "pipes", "windows", "detect", "change", "viewshed", "passability", "reflectance", "orthophoto",
     ),
-    "images": ("images", "colour", "ortho", "ndvi"),
+    "images": ("images", "colour", "ortho", "ndvi", "drape"),
     "this computer": ("warmup", "completion"),
 }  # fmt: skip
 """How `swath --help` and docs/commands.md group them; a command of another package is listed at the end."""

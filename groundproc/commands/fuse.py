@@ -15,6 +15,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "clouds", nargs="+", type=Path, metavar="CLOUD", help="LAS, LAZ or COPC, two or more; the first stays"
     )
     parser.add_argument("--registered", action="store_true", help="they lie on each other already")
+    parser.add_argument(
+        "--search",
+        action="store_true",
+        help="place and heading of the others are not known: look for them on the first",
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the cloud, .laz")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)
@@ -31,12 +36,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not 2 <= len(arguments.clouds) <= 255:
         raise UsageError(f"{len(arguments.clouds)} clouds given, expected 2 to 255")
+    if arguments.search and arguments.registered:
+        raise UsageError("--search and --registered: both given, expected one of them")
     expect(arguments.clouds, CLOUD, CLOUD_WORDS)
     claim_file(arguments.output, (".laz",), arguments.force, arguments.clouds)
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
-        laid = fuse(arguments.clouds, arguments.output, arguments.registered, bar.update)
+        laid = fuse(arguments.clouds, arguments.output, arguments.registered, bar.update, searched=arguments.search)
     if arguments.json is not None:
         write_json(arguments.json, {"clouds": told(laid)})
     for number, each in enumerate(laid):

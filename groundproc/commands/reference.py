@@ -10,18 +10,19 @@ READ_ON: Final = {
     "adjust": "methods/strips.md", "assess": "clouds.md#how-good-is-it", "bag": "ros.md", "batch": "campaigns.md",
     "calibrate": "methods/calibration.md", "change": "uses/change.md", "colour": "imagery.md",
     "compass": "methods/dynamic.md", "completion": "tutorial.md", "contours": "clouds.md#contours", "decode": "sensors.md",
-    "detect": "uses/detect.md", "export": "clouds.md", "fuse": "uses/fuse.md", "ground": "uses/ground.md",
+    "detect": "uses/detect.md", "drape": "uses/drape.md", "export": "clouds.md", "fuse": "uses/fuse.md", "ground": "uses/ground.md",
     "images": "imagery.md", "import": "importing.md", "info": "importing.md", "init": "survey.md",
     "live": "methods/live.md",
     "merge": "clouds.md#several-flights-in-one-cloud", "ndvi": "imagery.md", "ortho": "imagery.md", "orthophoto": "uses/reflectance.md",
     "passability": "uses/passability.md",
-    "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
+    "pipes": "uses/pipes.md", "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
     "pull": "install.md#get-the-logs-swath-pull", "raster": "clouds.md", "recover": "aircraft.md#flight-logs",
     "reflectance": "uses/reflectance.md", "replay": "tutorial.md", "report": "report.md", "section": "uses/section.md",
     "simulate": "simulator.md", "tile": "clouds.md#tiles", "tin": "clouds.md#triangles-for-design-and-machine-control",
     "trees": "uses/trees.md",
     "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
-    "warmup": "install.md#on-the-ground-compile-once", "wires": "uses/wires.md",
+    "warmup": "install.md#on-the-ground-compile-once", "windows": "uses/windows.md",
+    "wires": "uses/wires.md",
 }  # fmt: skip
 """Pages that say what a command is for and how it works."""
 

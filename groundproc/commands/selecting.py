@@ -32,7 +32,7 @@ def add_selection(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--lines", metavar="NUMBERS", help="flight lines kept (point_source_id): 1,3-5")
     parser.add_argument(
-        "--without-classes", metavar="NUMBERS", help="classes left out: 7,18,64 are noise and what moved"
+        "--without-classes", metavar="NUMBERS", help="classes left out: 7,18,69 are noise and what moved"
     )
 
 

@@ -17,6 +17,10 @@ REGISTRY: Final[dict[str, Entry]] = {
     ),
     "trees": Entry("groundproc.uses.trees", "make", "trees.geojson: place, height, crown, stem, dead ones"),
     "wires": Entry("groundproc.uses.wires", "make", "wires.geojson: wires, poles, masts, stays, fences; wires.laz with clearances"),
+    "pipes": Entry("groundproc.uses.pipes", "make", "pipes.geojson: axes with diameter, cover and free spans"),
+    "windows": Entry(
+        "groundproc.uses.windows", "make", "windows.laz: what is behind panes in class 68; walls.geojson"
+    ),
     "detect": Entry("groundproc.uses.detect", "make", "objects.geojson: hard targets; penetration.tif: where nothing can be claimed"),
     "passability": Entry(
         "groundproc.uses.passability", "make", "passability.tif, slope.tif, step.tif, obstacle.tif: where a vehicle can go"

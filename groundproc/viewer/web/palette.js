@@ -13,7 +13,8 @@ const CLASSES = {
   8: ["reserved", "#cccccc"], 9: ["water", "#4a90e2"], 10: ["rail", "#8a7f99"], 11: ["road", "#7d8794"], 13: ["wire guard", "#ffd76a"],
   14: ["wire conductor", "#ffc21a"], 15: ["tower", "#c78c2a"], 16: ["wire connector", "#ffe9a8"], 17: ["bridge deck", "#8fb3d9"],
   18: ["high noise", "#e04fb3"], 19: ["overhead structure", "#c9a58a"], 20: ["ignored ground", "#c9b79c"], 21: ["snow", "#eef6ff"],
-  22: ["temporal exclusion", "#f06a6a"],
+  22: ["temporal exclusion", "#f06a6a"], 64: ["mast", "#b98d4a"], 65: ["pole", "#d9a860"], 66: ["fence", "#9c7b5a"],
+  67: ["stay", "#e0c48a"], 68: ["pane, and what is behind it", "#6fd0e8"], 69: ["what moved", "#ff6b57"],
 };
 function rgb(hex) { return [1, 3, 5].map(i => parseInt(hex.slice(i, i + 2), 16)); }
 function scaleOf(name) {

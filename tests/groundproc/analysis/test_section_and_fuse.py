@@ -92,3 +92,54 @@ def test_clouds_of_other_kinds_are_laid_on_the_first(tmp_path: Path, capsys: pyt
     told = capsys.readouterr().err
     assert "of one place" in told or "on surfaces found" in told
     assert not (tmp_path / "g.laz").exists()
+
+
+def yard(rng: np.random.Generator, count: int, sheds: int = 9, seed: int = 4) -> np.ndarray:
+    """Uneven ground with sheds at places of their own, their walls too, 1 cm of noise."""
+    places = np.random.default_rng(seed)
+    xy = rng.uniform(-25, 25, (count, 2))
+    z = 0.3 * np.sin(xy[:, 0] / 4) + 0.2 * np.cos(xy[:, 1] / 3)
+    walls: list[np.ndarray] = []
+    for _ in range(sheds):
+        middle, half = places.uniform(-20, 20, 2), places.uniform(1.0, 3.0, 2)
+        inside = (np.abs(xy - middle) < half).all(axis=1)
+        z[inside] = 2.5 + 0.1 * (xy[inside, 0] - middle[0])
+        for axis in (0, 1):
+            wall = np.column_stack(
+                [middle + half * rng.uniform(-1, 1, (count // 100, 2)), rng.uniform(0.5, 2.3, count // 100)]
+            )
+            wall[:, axis] = middle[axis] + half[axis]
+            walls.append(wall)
+    xyz = np.concatenate([np.column_stack([xy, z]), *walls])
+    return np.asarray(xyz + rng.normal(0, 0.01, xyz.shape))
+
+
+def test_a_cloud_of_unknown_place_and_heading_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    a, b = yard(rng, 60_000), yard(rng, 60_000)
+    b = b[b[:, 0] > -12.0]  # three quarters of it
+    turn, shift = Rotation.from_euler("ZX", [143.0, 0.3], degrees=True), np.array([-310.0, 95.0, 7.0])
+    write(tmp_path / "a.laz", a)
+    write(tmp_path / "b.laz", turn.apply(b) + shift)
+    words = ["fuse", str(tmp_path / "a.laz"), str(tmp_path / "b.laz"), "-o", str(tmp_path / "f.laz")]
+    assert main([*words, "--search", "--json", str(tmp_path / "f.json")]) == 0
+    found = laspy.read(tmp_path / "f.laz").xyz[len(a) :] - ORIGIN - b
+    assert np.abs(found.mean(axis=0)).max() < 0.002
+    told = json.loads((tmp_path / "f.json").read_text())["clouds"][1]
+    off = Rotation.from_matrix(np.array(told["matrix"])[:3, :3]) * turn
+    assert np.rad2deg(off.magnitude()) < 0.01
+    assert told["correlation"] > 0.7
+    # another place, and one that fits twice
+    write(tmp_path / "c.laz", yard(rng, 40_000, seed=5))
+    half = yard(rng, 60_000, sheds=0)
+    half[:, 2] = np.where((np.abs(half[:, 0]) < 6) & (np.abs(half[:, 1]) < 3), 3.0, 0.0) + rng.normal(
+        0, 0.01, len(half)
+    )
+    write(tmp_path / "d.laz", half[::2])
+    write(tmp_path / "e.laz", half[1::2])
+    capsys.readouterr()
+    for first, second, said in (("a", "c", "no place of the second"), ("d", "e", "at two places alike")):
+        words = ["fuse", str(tmp_path / f"{first}.laz"), str(tmp_path / f"{second}.laz"), "-o", str(tmp_path / "g.laz")]
+        assert main([*words, "--search"]) == 1
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "g.laz").exists()
