@@ -21,7 +21,8 @@ READ_ON: Final = {
     "simulate": "simulator.md", "tile": "clouds.md#tiles", "tin": "clouds.md#triangles-for-design-and-machine-control",
     "trees": "uses/trees.md",
     "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
-    "warmup": "install.md#on-the-ground-compile-once", "windows": "uses/windows.md",
+    "warmup": "install.md#on-the-ground-compile-once", "wide": "imagery.md",
+    "windows": "uses/windows.md",
     "wires": "uses/wires.md",
 }  # fmt: skip
 """Pages that say what a command is for and how it works."""
