@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scene",
         metavar="NAME",
-        help="village, field, facade, panels, town, lake, wood, meadow, barefield, crops, slope or facades (village)",
+        help="village, field, facade, panels, town, lake, wood, meadow, barefield, crops, slope, facades or bank (village)",
     )
     parser.add_argument("--duration", type=float, metavar="S", help="seconds of flight (20)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="same seed, same bytes (1)")

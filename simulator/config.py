@@ -292,6 +292,7 @@ class FaultOptions:
         0.0, "the lidar's cable is out, neither data nor position packets come, from [s]", minimum=0, maximum=1e6
     )
     lidar_gap_s: float = option(0.5, "for [s]", minimum=0, maximum=1e4)
+    lidar_loss: float = option(0.0, "share of the lidar's packets that get lost, one by one", minimum=0, maximum=1)
     gnss_gap_at_s: float = option(
         0.0,
         "the GPS has no fix from [s]: GPS_RAW_INT says so, GLOBAL_POSITION_INT goes on by dead reckoning",
@@ -299,6 +300,19 @@ class FaultOptions:
         maximum=1e6,
     )
     gnss_gap_s: float = option(30.0, "for [s]", minimum=0, maximum=1e4)
+    gnss_glitch_at_s: float = option(
+        0.0,
+        "positions are off by gnss_glitch_m from [s]: a glitch, multipath or another height; velocities are not",
+        minimum=0,
+        maximum=1e6,
+    )
+    gnss_glitch_s: float = option(2.0, "for [s]", minimum=0, maximum=1e6)
+    gnss_glitch_rise_s: float = option(
+        0.0, "which they take to get there, and as long to come back [s]", minimum=0, maximum=1e4
+    )
+    gnss_glitch_m: tuple[float, float, float] = option(
+        (30.0, 0.0, 0.0), "east, north, up [m]", minimum=-1e5, maximum=1e5
+    )
     garbage_per_s: float = option(0.0, "bursts of line noise on the MAVLink bytes [1/s]", minimum=0, maximum=100)
 
 

@@ -61,12 +61,38 @@ class Outage:
         return self.start_s > 0 and self.start_s <= time_s < self.end_s
 
 
-def arriving(sent_s: npt.NDArray[np.float64], options: FaultOptions) -> npt.NDArray[np.bool_]:
+@dataclass(frozen=True, slots=True)
+class Glitch:
+    """A stretch of true time in which positions are off; never if start is 0."""
+
+    start_s: float
+    end_s: float
+    rise_s: float
+    off_m: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, options: FaultOptions) -> "Glitch":
+        """The glitch of a configuration."""
+        start_s = options.gnss_glitch_at_s
+        return cls(start_s, start_s + options.gnss_glitch_s, options.gnss_glitch_rise_s, options.gnss_glitch_m)
+
+    def at(self, time_s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """How far positions are off at true times, shape (n,): east, north, up, shape (n, 3) [m]."""
+        if self.start_s <= 0:
+            return np.zeros((len(time_s), 3))
+        rise_s = max(self.rise_s, 1e-9)
+        share = np.minimum((time_s - self.start_s) / rise_s, (self.end_s - time_s) / rise_s)
+        return np.asarray(np.clip(share, 0.0, 1.0)[:, None] * np.array(self.off_m))
+
+
+def arriving(sent_s: npt.NDArray[np.float64], options: FaultOptions, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
     """Which lidar packets are not lost, shape (n,)."""
-    if options.lidar_gap_at_s <= 0:
-        return np.ones(len(sent_s), np.bool_)
-    lost = (sent_s >= options.lidar_gap_at_s) & (sent_s < options.lidar_gap_at_s + options.lidar_gap_s)
-    return np.asarray(~lost)
+    kept = np.ones(len(sent_s), np.bool_)
+    if options.lidar_gap_at_s > 0:
+        kept &= (sent_s < options.lidar_gap_at_s) | (sent_s >= options.lidar_gap_at_s + options.lidar_gap_s)
+    if options.lidar_loss > 0:
+        kept &= rng.random(len(sent_s)) >= options.lidar_loss
+    return kept
 
 
 def garbage_before(rng: np.random.Generator, chance: float) -> bytes:

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 from flightlog.frames import ins_from_frd, mat_local_ins
 from simulator.chance import generator
-from simulator.config import InsOptions
-from simulator.faults import Outage
+from simulator.config import FaultOptions, InsOptions
+from simulator.faults import Glitch, Outage
 from simulator.flight import Flight
 from simulator.imu import Triad, Wander
 
@@ -69,8 +69,8 @@ class Ins:
     seed : int
     antenna_m : tuple of float, optional
         True place of the GPS antenna in the ins frame, to which positions belong [m]; none: to the IMU.
-    outage : Outage, optional
-        When there is no GPS.
+    faults : FaultOptions, optional
+        When there is no GPS, and when its positions are wrong.
     """
 
     def __init__(
@@ -79,9 +79,11 @@ class Ins:
         options: InsOptions,
         seed: int,
         antenna_m: tuple[float, float, float] | None = None,
-        outage: Outage | None = None,
+        faults: FaultOptions | None = None,
     ) -> None:
         self._flight, self._options = flight, options
+        faults = FaultOptions() if faults is None else faults
+        self._glitch, outage = Glitch.of(faults), Outage.of(faults)
         self._antenna_m = None if antenna_m is None else np.array(antenna_m)
         rng = generator(seed, "ins")
         time_s = np.arange(-_MARGIN_S, flight.duration_s + _MARGIN_S, _STEP_S)
@@ -117,7 +119,7 @@ class Ins:
         """On top of the gyros' biases [rad/s]."""
         self.accel_wander = Wander(generator(seed, "ins accelerometer walk"), flight.duration_s, o.accel_walk_m_s2)
         """On top of the accelerometers' biases [m/s^2]."""
-        if outage is not None and outage.start_s > 0:
+        if outage.start_s > 0:
             position = self._coasting(time_s, position, outage)
         self._position_error: BSpline = make_interp_spline(time_s, position, k=3)
         self._velocity_error: BSpline = self._position_error.derivative(1)
@@ -209,4 +211,5 @@ class Ins:
             position = position + mat @ self._antenna_m
             swing = np.cross(self._flight.rates_rad_s(time_s, self._gain), self._antenna_m)
             velocity = velocity + np.einsum("nij,nj->ni", mat, swing)
-        return position + self._position_error(time_s), velocity + self._velocity_error(time_s)
+        off = self._position_error(time_s) + self._glitch.at(time_s)
+        return position + off, velocity + self._velocity_error(time_s)

@@ -1,10 +1,10 @@
-"""Meadow, bare field, crops and a slope with bushes: hardly a wall, and little that is a plane but the ground."""
+"""Meadow, bare field, crops, a slope with bushes and the bank of a lake: hardly a wall, and little that is a plane but the ground."""
 
 import numpy as np
 import numpy.typing as npt
 
 from simulator.buildings import add_car, add_tree
-from simulator.meshes import prism
+from simulator.meshes import height_grid, prism, quad
 from simulator.moving import Tracks, over_ground
 from simulator.parts import Parts, World
 from simulator.route import Route
@@ -113,4 +113,37 @@ def slope(rng: np.random.Generator) -> Place:
         parts.world(),
         {"lines": Route(points_m=_lines(relief, rng, 7.0, 11.0), speed_m_s=5.0, loop_from=0)},
         Tracks(),
+    )
+
+
+def bank(rng: np.random.Generator) -> Place:
+    """Water to the horizon and one bank with tufts, reeds and a few bushes, flown along over the water."""
+    parts = Parts()
+    far_m = 300.0
+    relief = Relief.drawn(rng, ((40.0, 0.15), (9.0, 0.06), (2.5, 0.03)), (0.0, -0.06))
+    east, south = np.arange(-150.0, 150.5, 0.5), np.arange(-40.0, 0.5, 0.5)
+    x, y = np.meshgrid(east, south)
+    # the ground goes down into the water along a line that is not straight
+    z = relief.height(x, y) + 0.35 + rng.normal(scale=0.02, size=x.shape)
+    parts.add("ground", "grass", height_grid(east, south, z - np.where(y >= 0.0, 2.0, 0.0)))
+    parts.add("water", "water", quad((-far_m, -20.0, 0.0), (2.0 * far_m, 0, 0), (0, far_m, 0)))
+    for name, count, nearest_m, farthest_m, size_m in (
+        ("tufts", 1500, -38.0, -3.0, (0.1, 0.4)),
+        ("reeds", 700, -3.0, -0.3, (0.8, 1.6)),
+    ):
+        roots = np.column_stack([rng.uniform(-140.0, 140.0, count), rng.uniform(nearest_m, farthest_m, count)])
+        roots = np.column_stack([roots, relief.height(*roots.T) + 0.3])
+        size = np.column_stack([rng.uniform(0.2, 0.6, count), rng.uniform(*size_m, count)])
+        add_plants(parts, name, roots, size, 9, rng)
+    for i in range(14):
+        add_bush(
+            parts, f"bush {i}", relief.at(*rng.uniform((-120.0, -30.0), (120.0, -4.0)), 0.3), rng.uniform(0.8, 2.2), rng
+        )
+    low, high = rng.uniform(5.0, 9.0, 2).tolist()
+    points = ((-70.0, 7.0, low), (70.0, 9.0, high), (70.0, 15.0, high), (-70.0, 13.0, low))
+    walk = over_ground([(-60.0, -20.0), (60.0, -20.0), (60.0, -21.0), (-60.0, -21.0)], relief.height)
+    return (
+        parts.world(),
+        {"along": Route(points_m=points, speed_m_s=5.0, loop_from=0)},
+        Tracks(people=(walk,)),
     )

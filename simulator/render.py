@@ -122,7 +122,7 @@ class Simulation:
         self.flight = Flight(self.scene.route, job.duration_s, options.flight, seed)
         self.nominal_mount = logged_mount(self.scene.mount, options)
         self.mount = true_mount(self.nominal_mount, options, seed)
-        self.ins = Ins(self.flight, options.ins, seed, self.mount.gps_position_m, Outage.of(options.faults))
+        self.ins = Ins(self.flight, options.ins, seed, self.mount.gps_position_m, options.faults)
         self.traffic = Traffic(self.scene.tracks, options.moving, seed)
         self.lidar = Lidar(
             self.scene.world, self.flight, self.mount, self.clocks.lidar, options.lidar, seed, self.traffic
@@ -348,13 +348,14 @@ class Recording:
 
     def _add_lidar(self, chunk: int, start_s: float, end_s: float, sweep: Sweep) -> None:
         rng = generator(self._simulation.job.seed, "arrival", chunk)
-        kept = arriving(sweep.sent_s, self._options.faults)
+        lost = generator(self._simulation.job.seed, "lost packets", chunk)
+        kept = arriving(sweep.sent_s, self._options.faults, lost)
         packets = np.zeros(int(kept.sum()), records.SCAN_PACKET_DTYPE)
         packets["data"] = sweep.packets[kept]
         data_ns = np.maximum.accumulate(self._arrival_ns(sweep.sent_s, rng))[kept]
         records.set_receive_time_ns(packets, data_ns)
         positions, sent_s = self._simulation.telemetry.between(start_s, end_s, chunk)
-        kept = arriving(sent_s, self._options.faults)
+        kept = arriving(sent_s, self._options.faults, lost)
         position_ns = self._arrival_ns(sent_s, rng)
         # one by one: indexing with a mask would not copy the bytes between the fields, which are zero on the wire
         chunks = [(int(position_ns[i]), positions[i].tobytes()) for i in np.flatnonzero(kept)]

@@ -23,7 +23,7 @@ from simulator.ground import add_ground, ground_height
 from simulator.lake import lake
 from simulator.meshes import box, catenary, prism, quad
 from simulator.moving import Tracks, flat, over_ground
-from simulator.natural import bare_field, crops, meadow, slope
+from simulator.natural import bank, bare_field, crops, meadow, slope
 from simulator.parts import Parts, World
 from simulator.route import Route, eights
 from simulator.street import facades
@@ -214,6 +214,7 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] =
     "crops": (crops, Mount()),
     "slope": (slope, Mount()),
     "facades": (facades, Mount()),
+    "bank": (bank, Mount()),
 }
 
 

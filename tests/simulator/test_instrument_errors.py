@@ -11,7 +11,7 @@ from simulator.autopilot import Autopilot
 from simulator.chance import generator
 from simulator.clocks import clocks
 from simulator.config import FaultOptions, FlightOptions, InsOptions, MountOptions, Options, perfect
-from simulator.faults import Outage
+from simulator.faults import arriving
 from simulator.flight import Flight
 from simulator.geodesy import Origin
 from simulator.imu import Triad, Wander
@@ -26,8 +26,8 @@ def flown(seconds=30.0, seed=2):
     return Flight(scene("field", seed).route, seconds, CALM, seed)
 
 
-def believed(time_s, seed=2, outage=None, antenna_m=None, flight=None, **values):
-    ins = Ins(flight or flown(), replace(perfect(Options(), "ins").ins, **values), seed, antenna_m, outage)
+def believed(time_s, seed=2, faults=None, antenna_m=None, flight=None, **values):
+    ins = Ins(flight or flown(), replace(perfect(Options(), "ins").ins, **values), seed, antenna_m, faults)
     return ins, ins.belief(time_s, generator(seed, "test"))
 
 
@@ -128,9 +128,9 @@ def test_positions_are_those_of_the_antenna():
 
 
 def test_an_outage_coasts_by_the_tilt_error_and_comes_back():
-    gap = Outage(8.0, 23.0)
+    gap = FaultOptions(gnss_gap_at_s=8.0, gnss_gap_s=15.0)
     flight = flown()
-    _, seen = believed(TIME_S, flight=flight, outage=gap, tilt_sigma_deg=0.5)
+    _, seen = believed(TIME_S, flight=flight, faults=gap, tilt_sigma_deg=0.5)
     error = seen.position_m - flight.poses(TIME_S).position_m
     before, inside, after = TIME_S < 7.8, (TIME_S > 9) & (TIME_S < 23), TIME_S > 28.5
     assert np.abs(error[before]).max() < 0.01
@@ -146,7 +146,9 @@ def test_an_outage_coasts_by_the_tilt_error_and_comes_back():
 
 def test_an_accelerometers_bias_alone_drifts_by_half_its_square():
     flight = Flight(scene("panels", 1).route, 30.0, CALM, 1)
-    ins, seen = believed(np.array([25.0]), flight=flight, outage=Outage(5.0, 29.0), accel_bias_m_s2=0.1)
+    ins, seen = believed(
+        np.array([25.0]), flight=flight, faults=FaultOptions(gnss_gap_at_s=5.0, gnss_gap_s=24.0), accel_bias_m_s2=0.1
+    )
     drift = seen.position_m[0] - flight.poses(np.array([25.0])).position_m[0]
     # the tripod looks north and is level; 20 s, on a grid of 0.1 s
     assert drift[:2] == pytest.approx(0.5 * ins.accelerometers.bias[:2] * 20.0**2, rel=0.02)
@@ -154,8 +156,8 @@ def test_an_accelerometers_bias_alone_drifts_by_half_its_square():
 
 def test_messages_say_that_there_is_no_fix():
     options = replace(perfect(Options(), "ins"), faults=FaultOptions(gnss_gap_at_s=5.0, gnss_gap_s=4.0))
-    outage, flight = Outage.of(options.faults), flown(12.0)
-    ins, clock = Ins(flight, options.ins, 2, None, outage), clocks(options.clocks)
+    flight = flown(12.0)
+    ins, clock = Ins(flight, options.ins, 2, None, options.faults), clocks(options.clocks)
     frames = list(Autopilot(ins, clock, options, Origin(), 2).between(0.0, 12.0, 0))
     messages = [(f.built_s, ardupilotmega.MAVLink(None).parse_buffer(f.data)[0]) for f in frames]
     raw = [(t, m) for t, m in messages if m.get_type() == "GPS_RAW_INT"]
@@ -257,3 +259,25 @@ def test_a_lidar_without_cable_sends_neither_kind_of_packet(simulate):
         arrived = recorded.capture.arrival_s(size)
         assert np.diff(arrived).max() == pytest.approx(10.0, abs=0.02)
         assert np.sort(np.diff(arrived))[-2] < 0.1
+
+
+def test_a_glitch_moves_positions_and_not_velocities():
+    glitch = FaultOptions(
+        gnss_glitch_at_s=10.0, gnss_glitch_s=6.0, gnss_glitch_rise_s=2.0, gnss_glitch_m=(30.0, 0.0, -9.0)
+    )
+    flight = flown()
+    _, wrong = believed(TIME_S, faults=glitch, flight=flight)
+    _, right = believed(TIME_S, flight=flight)
+    off = wrong.position_m - right.position_m
+    assert (wrong.velocity_m_s == right.velocity_m_s).all()
+    assert off[(TIME_S < 10.0) | (TIME_S > 16.0)] == pytest.approx(0.0, abs=1e-9)
+    there = (TIME_S > 12.0) & (TIME_S < 14.0)
+    assert off[there] == pytest.approx(np.tile([30.0, 0.0, -9.0], (there.sum(), 1)))
+    assert off[np.argmin(np.abs(TIME_S - 11.0))] == pytest.approx([15.0, 0.0, -4.5], abs=0.1)
+
+
+def test_so_many_packets_get_lost():
+    sent_s = np.arange(20_000) / 1808.0
+    kept = arriving(sent_s, FaultOptions(lidar_loss=0.02), generator(1, "test"))
+    # 20 000 draws of 0.02: 0.001 is one sigma of their mean
+    assert kept.mean() == pytest.approx(0.98, abs=0.004)

@@ -84,7 +84,7 @@ def test_the_flights_are_listed(capsys):
     assert all(name in listed for name in plans.names())
 
 
-@pytest.mark.parametrize("name", ["meadow", "hover_lines", "crops", "slope", "barefield", "facades"])
+@pytest.mark.parametrize("name", ["meadow", "hover_lines", "crops", "slope", "barefield", "facades", "bank"])
 def test_natural_scenes_are_flown_with_the_instruments_of_the_survey(name):
     """But for what the air does to them: the line of the spin is that of a frame that gives way more than a tripod."""
     plan, survey = plans.plan(name), plans.plan("survey_fast_gyro")

@@ -150,7 +150,7 @@ def test_an_unknown_scene_is_refused_with_the_known_ones():
         scene("moon", 1)
 
 
-@pytest.mark.parametrize("name", ["meadow", "barefield", "crops", "slope", "facades"])
+@pytest.mark.parametrize("name", ["meadow", "barefield", "crops", "slope", "facades", "bank"])
 def test_a_natural_scene_is_another_with_another_seed(name):
     first, again, other = (scene(name, seed).world.triangles_m for seed in (1, 1, 2))
     assert (first == again).all()
