@@ -37,7 +37,7 @@ from groundproc.estimation.filtered import filtered_estimate
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.attitudes import attitude_track
-from groundproc.estimation.observations.fixes import position_track
+from groundproc.estimation.observations.fixes import mean_weights, position_track
 from groundproc.estimation.observations.observation import Flown, Observation
 from groundproc.estimation.observations.rows import turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
@@ -156,17 +156,19 @@ def own_part(start: Trajectory, run: Run | CausalRun) -> Trajectory:
 
 
 def on_fixes(part: Trajectory, given: Given) -> Trajectory:
-    """A trajectory moved as a whole to where the plain mean of the autopilot's positions has it, as an adjusted one lies (`fixes`)."""
+    """A trajectory moved as a whole to where the mean of the autopilot's positions has it, as an adjusted one lies (`fixes`)."""
     antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
-    total, weight = np.zeros(3), np.zeros(3)
+    offs, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for leg in given.placed:
         fixes = position_track(given, leg)
         poses, known = part.where_covered(fixes.time_ns)
         arm = frames.mat_from_quat(poses.quat_local_ins_wxyz[known]) @ antenna
-        off = fixes.position_m[known] - poses.position_m[known] - arm
-        total += (off / fixes.sigma_m[known] ** 2).sum(axis=0)
-        weight += (fixes.sigma_m[known] ** -2).sum(axis=0)
-    return replace(part, position_m=part.position_m + total / weight) if weight.all() else part
+        offs.append(fixes.position_m[known] - poses.position_m[known] - arm)
+        sigmas.append(fixes.sigma_m[known])
+    off, sigma = np.concatenate(offs), np.concatenate(sigmas)
+    if not len(off):
+        return part
+    return replace(part, position_m=part.position_m + (mean_weights(off, sigma) * off).sum(axis=0))
 
 
 def whole_run(
@@ -210,7 +212,7 @@ def adjust_run(
     sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
     attitudes = next((found for leg in legs if (found := attitude_track(leg)) is not None), None)
     stated = Recorded(position_track(given, legs[0]), attitudes)
-    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated)
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, guide=start)
     pace = Pace(progress)
     windows: list[Window] = []
     begin = 0

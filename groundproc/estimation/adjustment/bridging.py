@@ -21,6 +21,8 @@ FEWEST_MATCHED: Final = 50
 """Clusters that find something in the map, below which a slice is blind."""
 START: Final = 10
 """First slices that are not counted: there is no map yet."""
+KEPT: Final = 30
+"""Slices on end that hold and are worth keeping: three seconds."""
 SHORTEST: Final = 100
 """Slices of a stretch that is bridged: over less than 10 s inertial data between two good ends are better than any GNSS."""
 CLOSED: Final = 5
@@ -46,15 +48,29 @@ class Stretch:
 
 
 def unheld(track: Track) -> Mask:
-    """Slices in which the lidar does not hold the path, shape (n,): it sees next to nothing, or nothing that tells the way."""
-    return np.asarray(misleading(track) | _silent(track))
+    """Slices in which the lidar does not hold the path, shape (n,): it sees next to nothing, or some direction is not told."""
+    found = np.array(track.unheld_m) > TELLS_M
+    found[:START] = False
+    return np.asarray(found | _silent(track))
 
 
 def misleading(track: Track) -> Mask:
-    """Slices in which the lidar sees enough, and nothing that tells the way, shape (n,): what it seems to tell is noise."""
-    found = (np.array(track.unheld_m) > TELLS_M) & ~_silent(track)
+    """Slices in which the lidar sees enough, and nothing that tells the way, shape (n,): what it seems to tell is noise.
+
+    Where a single direction is missing, along a street or a bank, the others are good, and the adjustment has the one from inertial
+    sensors and fixes.
+    """
+    found = (np.array(track.next_unheld_m) > TELLS_M) & ~_silent(track)
     found[:START] = False
     return np.asarray(found)
+
+
+def holds_somewhere(track: Track) -> bool:
+    """Whether there is a stretch long enough to be worth keeping in which the lidar tells more than one direction less than all."""
+    loose = np.concatenate([[True], misleading(track) | _silent(track), [True]])
+    loose[1 : START + 1] = True
+    edges = np.flatnonzero(loose)
+    return bool(np.diff(edges).max(initial=0) > KEPT)
 
 
 def _silent(track: Track) -> Mask:

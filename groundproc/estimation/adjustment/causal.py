@@ -1,8 +1,8 @@
-"""The odometry alone as an estimate: nothing of the future is used."""
+"""The odometry alone as an estimate: nothing of the future is used, but that its first seconds are stated once there is a map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +13,10 @@ from groundproc.estimation.method import Given, Progress
 from groundproc.estimation.observations.attitudes import ATTITUDE_SIGMA_RAD, attitude_track
 from groundproc.estimation.observations.fixes import position_track
 from groundproc.estimation.observations.rows import H
+from groundproc.estimation.odometry.beginning import redo_beginning
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
-from groundproc.estimation.odometry.slices import slices
+from groundproc.estimation.odometry.slices import Slice, slices
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Recorded
 from groundproc.estimation.odometry.track import Track
@@ -26,13 +27,19 @@ from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
+FIRST: Final = 30
+"""Slices at the beginning, flown when there was no map yet, that are run again against what came after: they are stated late."""
+SETTLING: Final = 60
+"""Slices after which that is done: six seconds."""
+
 
 @dataclass(slots=True)
 class CausalRun:
     """The odometry alone: what was known at each moment, a tenth of a second late."""
 
     SIGMA_SOURCE: ClassVar = (
-        "the filter's covariance; position and heading as uncertain as the fix and the compass that it began from"
+        "the filter's covariance; position and heading as uncertain as the fix, the compass and the level "
+        "that it began from"
     )
 
     path: Path
@@ -51,8 +58,13 @@ class CausalRun:
         attitude, position = (
             np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (sigma[:, :3], sigma[:, 3:])
         )
-        attitude = np.hypot(attitude, ATTITUDE_SIGMA_RAD * np.array([1.0, 1.0, 2.5]))
-        return of_ins(self.path, self.motion, given.frame, mount, np.hypot(position, self.start_sigma_m), attitude)
+        whole = ATTITUDE_SIGMA_RAD * np.array([1.0, 1.0, 2.5])
+        # the map has the first heading and tilt: what they are off moves what lies far from the start
+        away = self.path.position_m - self.path.position_m[0]
+        level = np.hypot(away[:, 0], away[:, 1])[:, None]
+        swung = level * np.array([whole[2], whole[2], whole[0]])
+        position = np.sqrt(position**2 + self.start_sigma_m**2 + swung**2)
+        return of_ins(self.path, self.motion, given.frame, mount, position, np.hypot(attitude, whole))
 
     def bridged(self, made: Trajectory, begun: Trajectory) -> Trajectory:
         """As it is: what it began from knows of no more."""
@@ -100,8 +112,16 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
     positions = position_track(given, legs[0])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     stated = Recorded(positions, attitude_track(legs[0]))
-    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, keep=False)
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated)
+    early: list[Slice] = []
     for piece in slices(given, motion.start_ns, progress):
         tracker.feed(piece)
+        if tracker.keep and tracker.track is not None and tracker.odometry is not None:
+            early.append(piece)
+            if len(tracker.track) >= SETTLING:
+                redo_beginning(tracker.track, motion, early, tracker.odometry.state, FIRST)
+                tracker.keep = False
+                tracker.track.forget(len(tracker.track))
+                early.clear()
     track = tracked(tracker)
     return CausalRun(track.causal_path(motion), track, motion, positions.sigma_m[0])

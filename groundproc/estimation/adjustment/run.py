@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.mount import Mount
-from groundproc.estimation.adjustment.bridging import bridged, misleading, stretches, unheld
+from groundproc.estimation.adjustment.bridging import bridged, holds_somewhere, misleading, stretches, unheld
 from groundproc.estimation.adjustment.joining import Joined
 from groundproc.estimation.adjustment.sensorpath import lost, of_ins
 from groundproc.estimation.adjustment.windows import (
@@ -161,8 +161,8 @@ class Run:
         return float(unheld(self.track).sum() * H)
 
     def is_blind(self) -> bool:
-        """Whether the lidar held nothing for most of the flight: without better positions it then knows no more than what it began from."""
-        return self.blind_s() > 0.5 * len(self.track) * H and not self.sources.leads()
+        """Whether the lidar held nothing for long anywhere: without better positions it then knows no more than what it began from."""
+        return not holds_somewhere(self.track) and not self.sources.leads()
 
     def slid_sigmas(self) -> float:
         """How far the path slid away from the fixes within `DRIFT_S`, in sigmas of such a mean."""
@@ -187,7 +187,7 @@ class Run:
         if self.is_misled():
             return "the lidar misled the adjustment: the trajectory is what it began from"
         if self.is_blind():
-            return "for most of the flight the lidar sees nothing that tells the way: the trajectory is what the adjustment began from"
+            return "nowhere does the lidar see for long what tells the way: the trajectory is what the adjustment began from"
         blind, whole = self.blind_s(), len(self.track) * H
         if blind <= 0.02 * whole:
             return ""

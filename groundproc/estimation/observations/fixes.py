@@ -28,6 +28,7 @@ from groundproc.estimation.odometry.stated import Positions
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.sync.tracks import low_pass
 from groundproc.flight.timeline import Leg
+from groundproc.numerics.robust import huber, sigma_of_columns
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -43,6 +44,12 @@ not tell a delay: 5 m/s and 0.1 s are half a metre, in a direction that changes 
 DRIFT_S: Final = 10
 SLID_SIGMAS: Final = 6.0
 """A path that slides away from the fixes by more, in `DRIFT_S`, is worth a warning."""
+STEP_SIGMAS: Final = 4.0
+"""A step of the positions that is off by more loses weight (Huber)."""
+APART: Final = (4.0, 6.0)
+"""Deviations from the median from which on, and up to which, a fix loses its say about where the whole lies."""
+LEAST_SPREAD: Final = 0.5
+"""Fixes are not taken to agree better than this, in their sigmas: over seconds they all have the same error."""
 WRONG_SIGMAS: Final = 4.0
 """A path whose distance from the fixes is more, RMS, is worth a warning."""
 SLID: Final = "position_drift"
@@ -166,6 +173,8 @@ def position_factors(
         clock.add(builder, row, means(velocities(path, step, given.lever_m), group))
     time_s = (time_ns[middle] - time_ns[0]) * 1e-9
     course = whitened("position", residual, builder.matrix(), time_s, sigma, given.tau_s, given.white_m, Errors.ANCHOR)
+    # a receiver that jumps, or is led astray by a wall, goes where no vehicle does: its steps lose weight
+    course = replace(course, sigma=course.sigma / np.sqrt(huber(np.abs(course.residual) / course.sigma, STEP_SIGMAS)))
     if fixes_name(number) not in unknowns.names:
         return [course]
     return [course, _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)]
@@ -185,7 +194,7 @@ def _mean_factor(
     all that moves or turns the path as one moves their mean as it moves the mean of all. Bends are seen a little wrong; as the
     residual is that of the path as it is, that costs a step and not the result.
     """
-    weights = sigma**-2.0 / (sigma**-2.0).sum(axis=0)
+    weights = mean_weights(residual, sigma)
     builder, row = RowBuilder(3, unknowns), np.zeros(1, np.int64)
     centre = weights.T @ position_m
     some = np.unique(np.linspace(0, len(time_s) - 1, SAMPLES).round().astype(np.int64))
@@ -196,6 +205,24 @@ def _mean_factor(
     builder.by(row, "world.shift", eye(1))
     deviation = mean_sigma(time_s, sigma, weights, given.tau_s, given.white_m)
     return Factor("position mean", (weights * residual).sum(axis=0), builder.matrix(), deviation, errors=Errors.ANCHOR)
+
+
+def mean_weights(off_m: Array, sigma: Array) -> Array:
+    """Weights of fixes, shape (n, 3), sum 1 for each axis, by which their mean is taken; by 1 / sigma^2, without those that stand apart.
+
+    Parameters
+    ----------
+    off_m : ndarray, shape (n, 3)
+        What each is off the path. Those of a receiver that jumps or is led astray lie far from the median of all; of errors that last
+        none does, and the mean is the plain one.
+    sigma : ndarray, shape (n, 3)
+    """
+    middle = np.median(off_m, axis=0)
+    scale = np.maximum(sigma_of_columns(off_m, middle), LEAST_SPREAD * np.median(sigma, axis=0))
+    apart = (np.abs(off_m - middle) / scale).max(axis=1)
+    near = np.clip((APART[1] - apart) / (APART[1] - APART[0]), 0.0, 1.0)[:, None]
+    weights = near * sigma**-2.0
+    return np.asarray(weights / weights.sum(axis=0))
 
 
 def _shares(places: Array) -> Array:

@@ -30,7 +30,9 @@ SURE_M: Final = 0.15
 """Sigma of position beyond which the second run is not taken."""
 
 
-def redo_beginning(track: Track, motion: Motion, early: Sequence[Slice], state: State) -> None:
+def redo_beginning(
+    track: Track, motion: Motion, early: Sequence[Slice], state: State, count: int | None = None
+) -> None:
     """Run the first slices again and put the result into the track.
 
     Parameters
@@ -41,8 +43,10 @@ def redo_beginning(track: Track, motion: Motion, early: Sequence[Slice], state: 
         The first slices.
     state : State
         Of the odometry at the end of the track: biases and gravity, which are known by then.
+    count : int, optional
+        Slices that are run again; where left out `BEGINNING`, and no more than a third of a track that is short.
     """
-    count = min(BEGINNING, len(track) // 3)
+    count = min(BEGINNING, len(track) // 3) if count is None else count
     if count < 20:
         return
     end_ns = motion.start_ns + (track.first + count) * SLICE_NS
@@ -86,7 +90,8 @@ def redo_beginning(track: Track, motion: Motion, early: Sequence[Slice], state: 
         clusters = seen.clusters.copy()
         clusters["time_ns"] = end_ns - clusters["time_ns"]
         track.clusters[k] = thinned(clusters, seen.world_m, odometry.map, KEPT)
-        track.matched[k], track.residual_m[k], track.unheld_m[k] = seen.matched, seen.residual_m, seen.unheld_m
+        track.matched[k], track.residual_m[k] = seen.matched, seen.residual_m
+        track.unheld_m[k], track.next_unheld_m[k] = seen.unheld_m, seen.next_unheld_m
 
 
 def _map_of(track: Track, motion: Motion, first: int, last: int) -> PlaneMap:

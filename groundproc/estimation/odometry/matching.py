@@ -287,15 +287,19 @@ def _accumulate(
 
 
 @njit(cache=True, nogil=True)
-def weakest(information: Array) -> float:
-    """How well the least known direction of a pose is told, one sigma [m]; turns count by what they move at the mean distance."""
+def weakest(information: Array) -> tuple[float, float]:
+    """How well the direction of a pose that is told least is told, and the next, one sigma [m].
+
+    Turns count by what they move at the mean distance.
+    """
     turn = information[0, 0] + information[1, 1] + information[2, 2]
     shift = information[3, 3] + information[4, 4] + information[5, 5]
     arm = np.sqrt(max(turn, 1e-12) / max(shift, 1e-12))
     scaled = information.copy()
     scaled[:3, :] /= arm
     scaled[:, :3] /= arm
-    return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(scaled)[0], 1e-6)))
+    values = np.linalg.eigvalsh(scaled)
+    return 1.0 / np.sqrt(max(values[0], 1e-6)), 1.0 / np.sqrt(max(values[1], 1e-6))
 
 
 @njit(cache=True, nogil=True)
@@ -331,7 +335,7 @@ def update(
 ) -> Any:
     """Correct a state by the planes and leaves that clusters lie on.
 
-    Gives how many do, their RMS distance from planes, sigma of the direction that they tell least of [m], and the covariance.
+    Gives how many do, their RMS distance from planes, sigmas of the two directions that they tell least of [m], and the covariance.
     """
     quat, position = state.quat, state.position_m
     to_pose, mine = np.ascontiguousarray(covariance[:, :6]), np.ascontiguousarray(covariance[:6, :6])

@@ -45,8 +45,8 @@ class Step:
         Clusters of all lasers, and those that found a plane.
     residual_m : float
         RMS distance from it.
-    unheld_m : float
-        Sigma of the direction that they tell least of; infinite before there is a map.
+    unheld_m, next_unheld_m : float
+        Sigmas of the two directions that they tell least of; infinite before there is a map.
     """
 
     number: int
@@ -61,6 +61,7 @@ class Step:
     matched: int
     residual_m: float
     unheld_m: float
+    next_unheld_m: float
 
 
 class Odometry:
@@ -127,7 +128,7 @@ class Odometry:
         start_ns = self._motion.start_ns + piece.number * STEPS * STEP_NS
         clusters, world = self._cluster(piece, start_ns, quats, positions)
         s = self.state
-        matched, residual, unheld = 0, float("nan"), float("inf")
+        matched, residual, unheld = 0, float("nan"), (float("inf"), float("inf"))
         # in the body at the slice's end, where the prediction between the instants stands
         mat = np.empty((3, 3))
         mat_of_quat(s.quat, mat)
@@ -149,7 +150,7 @@ class Odometry:
             self.map.forget_beyond(s.position_m, self.REACH_M)
         return Step(
             piece.number, s.quat.copy(), s.position_m.copy(), s.velocity_m_s.copy(), s.gyro_bias_rad_s.copy(),
-            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, seen, matched, residual, unheld,
+            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, seen, matched, residual, *unheld,
         )  # fmt: skip
 
     def position_fix(self, position_m: Array, sigma_m: Array) -> None:

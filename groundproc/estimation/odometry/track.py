@@ -42,8 +42,8 @@ class Track:
     matched, seen : list of int
         Clusters that found a plane, and all.
     residual_m : list of float
-    unheld_m : list of float
-        Sigma of the direction that a slice tells least of.
+    unheld_m, next_unheld_m : list of float
+        Sigmas of the two directions that a slice tells least of.
     restarts : int
         How often it lost its way.
     fixes, late_fixes : int
@@ -63,6 +63,7 @@ class Track:
     seen: list[int] = field(default_factory=list)
     residual_m: list[float] = field(default_factory=list)
     unheld_m: list[float] = field(default_factory=list)
+    next_unheld_m: list[float] = field(default_factory=list)
     restarts: int = 0
     fixes: int = 0
     late_fixes: int = 0
@@ -111,7 +112,7 @@ class Track:
         self.first += slices
         for table in (
             self.quat, self.position_m, self.velocity_m_s, self.gyro_bias, self.sigma, self.clusters, self.matched,
-            self.seen, self.residual_m, self.unheld_m,
+            self.seen, self.residual_m, self.unheld_m, self.next_unheld_m,
         ):  # fmt: skip
             del table[:slices]
 

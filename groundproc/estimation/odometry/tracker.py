@@ -29,6 +29,12 @@ LOST_M: Final = 15.0
 LOST_SIGMAS: Final = 6.0
 LOST_FIXES: Final = 8
 """So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew."""
+CHECKED: Final = 10
+"""Slices over which the way is compared with a guide's: a second."""
+ASTRAY_M: Final = 1.0
+"""What it may differ by; a smoother's velocity is right to 0.1 to 0.3 m/s."""
+SURE_HELD_M: Final = 0.03
+"""A way that slices tell better than this is the lidar's to tell."""
 FIX_TAU_S: Final = 1.0
 """The filter takes positions as if their errors lasted so long: light beside the lidar, and firm enough to hold it where there is none."""
 RECENT_S: Final = 0.5
@@ -59,18 +65,21 @@ class Tracker:
     stated : Stated
     keep : bool
         Whether clusters are kept for the batch.
+    guide : RoughPoses, optional
+        Poses whose motion within a second is right to less than a metre, as a smoother's is: an odometry that goes elsewhere, and is
+        held by little, has lost its way.
     """
 
     def __init__(
         self, motion: MotionGrid, rough: RoughPoses, mat_ins_lidar: Array, lever_m: Array, gyro_bias: Array,
-        stated: Stated, keep: bool = True,
+        stated: Stated, keep: bool = True, guide: RoughPoses | None = None,
     ) -> None:  # fmt: skip
         self.motion, self._rough, self._mat, self._lever = motion, rough, mat_ins_lidar, lever_m
-        self._bias, self._stated, self._keep = gyro_bias, stated, keep
+        self._bias, self._stated, self.keep = gyro_bias, stated, keep
         self.odometry: Odometry | None = None
         self.track: Track | None = None
         self._far, self._next_attitude_ns = 0, 0
-        self._range_m = 0.0
+        self._range_m, self._guide, self._checked = 0.0, guide, 0
         self._bearing = Bearing(np.zeros(3))
         self._history, self._begin_ns = History(), 0
 
@@ -91,6 +100,8 @@ class Tracker:
         step = odometry.step(piece)
         self._take_stated(odometry)
         self._note(odometry, step)
+        if self._is_astray(odometry):
+            self._restart(odometry)
         return step
 
     def gyro_bias(self) -> Array:
@@ -143,7 +154,8 @@ class Tracker:
         track.seen.append(0 if step is None else step.seen)
         track.residual_m.append(float("nan") if step is None else step.residual_m)
         track.unheld_m.append(float("inf") if step is None else step.unheld_m)
-        if step is None or not self._keep:
+        track.next_unheld_m.append(float("inf") if step is None else step.next_unheld_m)
+        if step is None or not self.keep:
             track.clusters.append(NO_CLUSTERS)
         else:
             track.clusters.append(thinned(step.clusters, step.world_m, odometry.map, KEPT))
@@ -216,6 +228,24 @@ class Tracker:
             odometry.state, odometry.map = state, PlaneMap(odometry.voxel_m)
             self.track.restarts += 1
             self._set_out(state, odometry.number)
+
+    def _is_astray(self, odometry: Odometry) -> bool:
+        """Whether the last second's way is not the guide's, though the lidar tells it, and not well: what is no surface holds it."""
+        track = self.track
+        assert track is not None
+        first = len(track) - CHECKED
+        if self._guide is None or first < self._checked or float(np.median(track.unheld_m[first:])) < SURE_HELD_M:
+            return False
+        self._checked = len(track)
+        now_ns = self._now_ns(odometry)
+        poses, covered = self._guide.where_covered(np.array([now_ns - CHECKED * SLICE_NS, now_ns]))
+        if not covered.all():
+            return False
+        mats = frames.mat_from_quat(poses.quat_local_ins_wxyz)
+        places = poses.position_m + mats @ self._lever
+        turned = frames.mat_from_quat(odometry.state.quat[None])[0] @ (mats[1] @ self._mat).T
+        way = track.position_m[-1] - track.position_m[first]
+        return float(np.linalg.norm(way - turned @ (places[1] - places[0]))) > ASTRAY_M
 
     def _state_at(self, number: int) -> State | None:
         return state_at(number, self.motion, self._rough, self._mat, self._lever, self.gyro_bias())
