@@ -136,9 +136,8 @@ def bank(rng: np.random.Generator) -> Place:
         size = np.column_stack([rng.uniform(0.2, 0.6, count), rng.uniform(*size_m, count)])
         add_plants(parts, name, roots, size, 9, rng)
     for i in range(14):
-        add_bush(
-            parts, f"bush {i}", relief.at(*rng.uniform((-120.0, -30.0), (120.0, -4.0)), 0.3), rng.uniform(0.8, 2.2), rng
-        )
+        x, y = rng.uniform((-120.0, -30.0), (120.0, -4.0)).tolist()
+        add_bush(parts, f"bush {i}", relief.at(x, y, 0.3), rng.uniform(0.8, 2.2), rng)
     low, high = rng.uniform(5.0, 9.0, 2).tolist()
     points = ((-70.0, 7.0, low), (70.0, 9.0, high), (70.0, 15.0, high), (-70.0, 13.0, low))
     walk = over_ground([(-60.0, -20.0), (60.0, -20.0), (60.0, -21.0), (-60.0, -21.0)], relief.height)

@@ -12,6 +12,7 @@ from groundproc.estimation.observations.fixes import POSITION_TAU_S
 from groundproc.estimation.odometry.grid import SLICE_NS
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.track import Track
+from groundproc.estimation.odometry.tracker import SURE_HELD_M
 from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -25,6 +26,8 @@ KEPT: Final = 30
 """Slices on end that hold and are worth keeping: three seconds."""
 SHORTEST: Final = 100
 """Slices of a stretch that is bridged: over less than 10 s inertial data between two good ends are better than any GNSS."""
+TAIL_NS: Final = 500_000_000
+"""So much at the end of a flight may lie beyond what the smoother covers."""
 CLOSED: Final = 5
 """Slices that seem to hold between two stretches and are fewer belong to them."""
 
@@ -58,19 +61,24 @@ def misleading(track: Track) -> Mask:
     """Slices in which the lidar sees enough, and nothing that tells the way, shape (n,): what it seems to tell is noise.
 
     Where a single direction is missing, along a street or a bank, the others are good, and the adjustment has the one from inertial
-    sensors and fixes.
+    sensors and fixes. A lidar that has led astray once is believed where it holds the path firmly and nowhere else.
     """
-    found = (np.array(track.next_unheld_m) > TELLS_M) & ~_silent(track)
+    limit_m = SURE_HELD_M if track.astray else TELLS_M
+    found = (np.array(track.next_unheld_m) > limit_m) & ~_silent(track)
     found[:START] = False
     return np.asarray(found)
 
 
+def loose(track: Track) -> Mask:
+    """Slices whose motion a smoother knows better, shape (n,): where the lidar sees next to nothing, or nothing that tells the way."""
+    return np.asarray(misleading(track) | _silent(track))
+
+
 def holds_somewhere(track: Track) -> bool:
-    """Whether there is a stretch long enough to be worth keeping in which the lidar tells more than one direction less than all."""
-    loose = np.concatenate([[True], misleading(track) | _silent(track), [True]])
-    loose[1 : START + 1] = True
-    edges = np.flatnonzero(loose)
-    return bool(np.diff(edges).max(initial=0) > KEPT)
+    """Whether there is a stretch long enough to be worth keeping in which the lidar tells the way, but perhaps for one direction."""
+    ends = np.concatenate([[True], loose(track), [True]])
+    ends[1 : START + 1] = True
+    return bool(np.diff(np.flatnonzero(ends)).max(initial=0) > KEPT)
 
 
 def _silent(track: Track) -> Mask:
@@ -79,9 +87,9 @@ def _silent(track: Track) -> Mask:
     return np.asarray(found)
 
 
-def stretches(loose: Mask, start_ns: int) -> list[Stretch]:
+def stretches(given: Mask, start_ns: int) -> list[Stretch]:
     """Stretches of loose slices that are long enough, of slices that begin at `start_ns`."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], loose, [False]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], given, [False]])))
     found: list[list[int]] = []
     for first, last in edges.reshape(-1, 2).tolist():
         if found and first - found[-1][1] < CLOSED:
@@ -89,13 +97,13 @@ def stretches(loose: Mask, start_ns: int) -> list[Stretch]:
         else:
             found.append([first, last])
     return [
-        Stretch(start_ns + first * SLICE_NS, start_ns + last * SLICE_NS, first > START, last < len(loose))
+        Stretch(start_ns + first * SLICE_NS, start_ns + last * SLICE_NS, first > START, last < len(given))
         for first, last in found
         if last - first >= SHORTEST
     ]
 
 
-def bridged(made: Trajectory, begun: Trajectory, loose: Sequence[Stretch]) -> Trajectory:
+def bridged(made: Trajectory, begun: Trajectory, parts: Sequence[Stretch]) -> Trajectory:
     """A trajectory whose loose stretches have the motion of another, laid between the good poses at their ends.
 
     What the ends do not agree on is spread evenly over the time between them.
@@ -104,30 +112,42 @@ def bridged(made: Trajectory, begun: Trajectory, loose: Sequence[Stretch]) -> Tr
     ----------
     made, begun : Trajectory
         As adjusted, and what it began from; stretches that the latter does not cover are left as they are.
-    loose : sequence of Stretch
+    parts : sequence of Stretch
     """
     position, quat = made.position_m.copy(), made.quat_local_ins_wxyz.copy()
     sigma_position, sigma_attitude = made.sigma_position_m.copy(), made.sigma_attitude_rad.copy()
     changed = np.zeros(len(made), np.bool_)
-    for each in loose:
+    for each in parts:
         here = np.flatnonzero((made.time_ns >= each.begin_ns) & (made.time_ns <= each.end_ns))
         if len(here) < 2 or not (each.held_before or each.held_after):
             continue
         time_ns = made.time_ns[here]
+        until = each.end_ns if each.held_after else each.end_ns - TAIL_NS
         poses, covered = begun.where_covered(time_ns)
-        if not covered.all():
+        if not covered[time_ns <= until].all():
             continue
+        # the smoother ends with its last node: what is left of a stretch that ends the flight stays as it was adjusted
+        here, time_ns = here[covered], time_ns[covered]
+        poses, _ = begun.where_covered(time_ns)
+        rest = np.flatnonzero(made.time_ns > time_ns[-1]) if not each.held_after else here[:0]
+        last = here[-1]
+        was = position[last].copy(), quat[last].copy()
         seconds = (time_ns - time_ns[0]) * 1e-9
         position[here], quat[here] = _laid(
             (made.position_m[here], made.quat_local_ins_wxyz[here]),
             (poses.position_m, poses.quat_local_ins_wxyz),
             _shares(seconds, each),
         )
+        if len(rest):
+            turn = frames.quat_multiply(quat[[last]], frames.quat_inverse(was[1][None]))
+            position[rest] = position[last] + (position[rest] - was[0]) @ frames.mat_from_quat(turn)[0].T
+            quat[rest] = frames.quat_multiply(np.repeat(turn, len(rest), axis=0), quat[rest])
         own = np.nan_to_num(np.sqrt(np.diagonal(begun.covariance_at(time_ns), axis1=1, axis2=2)))
         drift = np.sqrt(-2.0 * np.expm1(-_away(seconds, each)[:, None] / POSITION_TAU_S))
         sigma_position[here] = np.hypot(sigma_position[here], np.minimum(drift, 1.0) * own[:, :3])
         sigma_attitude[here] = np.hypot(sigma_attitude[here], own[:, 3:])
-        changed[here] = True
+        sigma_position[rest], sigma_attitude[rest] = sigma_position[last], sigma_attitude[last]
+        changed[here] = changed[rest] = True
     if not changed.any():
         return made
     velocity, rate = made.velocity_m_s.copy(), made.rate_rad_s.copy()

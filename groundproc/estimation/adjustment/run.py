@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.mount import Mount
-from groundproc.estimation.adjustment.bridging import bridged, holds_somewhere, misleading, stretches, unheld
+from groundproc.estimation.adjustment.bridging import bridged, holds_somewhere, loose, stretches, unheld
 from groundproc.estimation.adjustment.joining import Joined
 from groundproc.estimation.adjustment.sensorpath import lost, of_ins
 from groundproc.estimation.adjustment.windows import (
@@ -180,7 +180,7 @@ class Run:
         """A trajectory of this run with the motion of what it began from where the lidar sees nothing that tells the way."""
         if self.sources.leads():
             return made
-        return bridged(made, begun, stretches(misleading(self.track), int(self.path.start_ns)))
+        return bridged(made, begun, stretches(loose(self.track), int(self.path.start_ns)))
 
     def note(self) -> str:
         """What a reader must know though nothing is wrong."""

@@ -46,6 +46,8 @@ class Track:
         Sigmas of the two directions that a slice tells least of.
     restarts : int
         How often it lost its way.
+    astray : int
+        How often that was told by a guide: what seemed to hold the path did not.
     fixes, late_fixes : int
         Positions that were used, and those that came too late for it.
     voxel_m : float
@@ -65,6 +67,7 @@ class Track:
     unheld_m: list[float] = field(default_factory=list)
     next_unheld_m: list[float] = field(default_factory=list)
     restarts: int = 0
+    astray: int = 0
     fixes: int = 0
     late_fixes: int = 0
     voxel_m: float = 0.5

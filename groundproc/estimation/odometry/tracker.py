@@ -10,6 +10,7 @@ from flightlog.errors import LogError
 from groundproc.estimation.odometry.bearing import Bearing
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.history import History
+from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import MotionGrid
 from groundproc.estimation.odometry.odometry import Odometry, Step
 from groundproc.estimation.odometry.slices import Slice
@@ -31,7 +32,7 @@ LOST_FIXES: Final = 8
 """So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew."""
 CHECKED: Final = 10
 """Slices over which the way is compared with a guide's: a second."""
-ASTRAY_M: Final = 1.0
+ASTRAY_M: Final = 1.5
 """What it may differ by; a smoother's velocity is right to 0.1 to 0.3 m/s."""
 SURE_HELD_M: Final = 0.03
 """A way that slices tell better than this is the lidar's to tell."""
@@ -66,7 +67,7 @@ class Tracker:
     keep : bool
         Whether clusters are kept for the batch.
     guide : RoughPoses, optional
-        Poses whose motion within a second is right to less than a metre, as a smoother's is: an odometry that goes elsewhere, and is
+        Poses whose motion within a second is right to a few decimetres, as a smoother's is: an odometry that goes elsewhere, and is
         held by little, has lost its way.
     """
 
@@ -101,7 +102,7 @@ class Tracker:
         self._take_stated(odometry)
         self._note(odometry, step)
         if self._is_astray(odometry):
-            self._restart(odometry)
+            self._restart(odometry, astray=True)
         return step
 
     def gyro_bias(self) -> Array:
@@ -220,13 +221,14 @@ class Tracker:
         if self._far >= LOST_FIXES:
             self._restart(odometry)
 
-    def _restart(self, odometry: Odometry) -> None:
-        """The odometry has lost its way: begin anew from a rough pose, with a new map."""
+    def _restart(self, odometry: Odometry, astray: bool = False) -> None:
+        """The odometry has lost its way: begin anew from a rough pose, with a new map; `astray`: a guide told."""
         assert self.track is not None
         state = self._state_at(odometry.number)
         if state is not None:
             odometry.state, odometry.map = state, PlaneMap(odometry.voxel_m)
             self.track.restarts += 1
+            self.track.astray += astray
             self._set_out(state, odometry.number)
 
     def _is_astray(self, odometry: Odometry) -> bool:
@@ -234,7 +236,9 @@ class Tracker:
         track = self.track
         assert track is not None
         first = len(track) - CHECKED
-        if self._guide is None or first < self._checked or float(np.median(track.unheld_m[first:])) < SURE_HELD_M:
+        if self._guide is None or first < self._checked:
+            return False
+        if not SURE_HELD_M < float(np.median(track.unheld_m[first:])) <= TELLS_M:
             return False
         self._checked = len(track)
         now_ns = self._now_ns(odometry)

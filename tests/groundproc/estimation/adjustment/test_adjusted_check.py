@@ -19,7 +19,8 @@ class SeenTrack:
     """Ten seconds in which the lidar saw planes enough."""
 
     def __init__(self, restarts: int) -> None:
-        self.restarts, self.matched, self.unheld_m = restarts, [500] * 100, [0.01] * 100
+        self.restarts, self.astray, self.matched = restarts, 0, [500] * 100
+        self.unheld_m = self.next_unheld_m = [0.01] * 100
 
     def __len__(self) -> int:
         return len(self.matched)

@@ -9,7 +9,17 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
-from groundproc.estimation.adjustment.bridging import SHORTEST, START, Stretch, bridged, misleading, stretches, unheld
+from groundproc.estimation.adjustment.bridging import (
+    KEPT,
+    SHORTEST,
+    START,
+    Stretch,
+    bridged,
+    holds_somewhere,
+    misleading,
+    stretches,
+    unheld,
+)
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.geodesy import LocalFrame
@@ -115,6 +125,17 @@ def test_what_the_smoother_does_not_cover_stays_as_it_is() -> None:
     assert bridged(made, smoothers(true), []) is made
 
 
+def test_the_last_moments_that_the_smoother_does_not_cover_go_on_from_where_it_ends() -> None:
+    true = flown()
+    torn = replace(true, position_m=true.position_m.copy())
+    loose = torn.time_ns > END_NS
+    torn.position_m[loose] += 5.0
+    short = smoothers(true).before(int(true.time_ns[-1]) - 100_000_000)
+    made = bridged(torn, short, [Stretch(END_NS, int(true.time_ns[-1]), True, False)])
+    np.testing.assert_allclose(made.position_m, true.position_m, atol=1e-6)
+    assert (np.diff(made.sigma_position_m[loose], axis=0) >= 0.0).all()
+
+
 def test_only_long_stretches_are_bridged_and_those_that_all_but_touch_are_one() -> None:
     loose = np.zeros(600, np.bool_)
     loose[50:130] = loose[133:200] = True  # three slices between them
@@ -128,8 +149,38 @@ def test_only_long_stretches_are_bridged_and_those_that_all_but_touch_are_one() 
 
 
 def test_blind_is_who_sees_nothing_and_misled_who_sees_nothing_that_tells_the_way() -> None:
-    track: Any = SimpleNamespace(unheld_m=[0.01] * 60, matched=[500] * 60)
+    track: Any = SimpleNamespace(unheld_m=[0.01] * 60, matched=[500] * 60, astray=0)
     track.unheld_m[:5], track.unheld_m[20:25] = [np.inf] * 5, [2.0 * TELLS_M] * 5
+    track.next_unheld_m = track.unheld_m
     track.unheld_m[40:45], track.matched[40:45] = [np.inf] * 5, [0] * 5
     assert np.flatnonzero(misleading(track)).tolist() == [20, 21, 22, 23, 24]
     assert np.flatnonzero(unheld(track)).tolist() == [20, 21, 22, 23, 24, 40, 41, 42, 43, 44]
+
+
+def seen(slices: int, unheld_m: float, next_unheld_m: float, matched: int = 500, astray: int = 0) -> Any:
+    return SimpleNamespace(
+        unheld_m=[unheld_m] * slices, next_unheld_m=[next_unheld_m] * slices, matched=[matched] * slices, astray=astray
+    )
+
+
+def test_a_single_direction_that_is_not_told_leaves_the_others_to_the_adjustment() -> None:
+    """Along a street or a bank: its other five directions are better than a smoother's."""
+    street = seen(200, 10.0 * TELLS_M, 0.02)
+    assert not misleading(street).any()
+    assert unheld(street).sum() == 200 - START
+    assert misleading(seen(200, 10.0 * TELLS_M, 2.0 * TELLS_M)).sum() == 200 - START
+
+
+def test_who_has_led_astray_is_believed_where_he_is_sure() -> None:
+    assert not misleading(seen(200, 0.05, 0.05)).any()
+    assert misleading(seen(200, 0.05, 0.05, astray=1)).sum() == 200 - START
+    assert not misleading(seen(200, 0.01, 0.01, astray=1)).any()
+
+
+@pytest.mark.parametrize(("held", "kept"), [(KEPT + 1, True), (KEPT - 1, False)])
+def test_a_few_seconds_that_hold_are_worth_keeping(held: int, kept: bool) -> None:
+    """Most of the flight is over water: what is seen of the shore stays."""
+    track = seen(300, np.inf, np.inf, matched=0)
+    for column, value in ((track.unheld_m, 0.01), (track.next_unheld_m, 0.01), (track.matched, 500)):
+        column[100 : 100 + held] = [value] * held
+    assert holds_somewhere(track) is kept

@@ -389,6 +389,20 @@ def test_too_few_observations_are_none(path: Path) -> None:
 # Noise -----------------------------------------------------------------------------------------------------------------
 
 
+def test_fixes_that_stand_apart_do_not_say_where_the_whole_lies() -> None:
+    """Ten of sixty seconds 30 m off, as beside a wall, move the plain mean by 5 m."""
+    time_s = np.arange(60.0)
+    lasting = 1.5 * np.stack([np.sin(time_s / 12.0), np.cos(time_s / 15.0), np.sin(time_s / 20.0 + 1.0)], axis=1)
+    sigma = np.full((60, 3), 2.5)
+    weights = fixes.mean_weights(lasting, sigma)
+    np.testing.assert_allclose(weights, 1.0 / 60.0)  # errors that last are all right: the mean is the plain one
+    astray = lasting.copy()
+    astray[20:30] += [30.0, 0.0, -10.0]
+    weights = fixes.mean_weights(astray, sigma)
+    assert not weights[20:30].any()
+    np.testing.assert_allclose((weights * astray).sum(axis=0), np.delete(lasting, np.s_[20:30], axis=0).mean(axis=0))
+
+
 def gauss_markov(time_s: Array, sigma: float, tau_s: float) -> Array:
     return np.asarray(sigma**2 * np.exp(-np.abs(time_s[:, None] - time_s) / tau_s))
 

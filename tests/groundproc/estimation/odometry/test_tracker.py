@@ -1,6 +1,7 @@
 """What keeps the odometry going: positions and attitudes in time and late, the history that these are compared with."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from groundproc.estimation.odometry.history import KEPT, History
 from groundproc.estimation.odometry.motion import Motion
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.stated import Attitudes, Fix, Positions, Recorded
-from groundproc.estimation.odometry.tracker import FEWEST, Tracker
+from groundproc.estimation.odometry.tracker import CHECKED, FEWEST, Tracker
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -152,3 +153,22 @@ def test_a_log_gives_each_position_once_and_none_from_before_a_start() -> None:
     assert stated.attitude(int(time_ns[-1]) + 250_000_000) is None
     assert stated.attitude(START_NS) is None
     assert Recorded(positions, None).attitude(START_NS + 1_100_000_000) is None
+
+
+@pytest.mark.parametrize(
+    ("guide_m_s", "unheld_m", "astray"), [(8.0, 0.05, 1), (5.5, 0.05, 0), (8.0, 0.01, 0), (8.0, 5.0, 0)]
+)
+def test_what_seems_to_hold_the_path_and_leads_it_elsewhere_is_noticed_in_a_second(
+    guide_m_s: float, unheld_m: float, astray: int
+) -> None:
+    """Held firmly, it is the lidar's to tell; held by nothing, the way is that of the inertial sensors, and no map is wrong."""
+    motion, rough = straight()
+    east = np.stack([(guide_m_s - NORTH_M_S) * (rough.time_ns - START_NS) * 1e-9, *np.zeros((2, len(rough)))], axis=1)
+    guide = replace(rough, position_m=rough.position_m + east)
+    tracker = Tracker(motion, rough, np.eye(3), np.zeros(3), np.zeros(3), Late(0), keep=False, guide=guide)
+    for number in range(CHECKED + 2):
+        if tracker.track is not None:
+            tracker.track.unheld_m[:] = [unheld_m] * len(tracker.track)
+        tracker.feed(Slice(number, np.empty(0, np.int64), np.empty((0, 3), np.float32)))
+    assert tracker.track is not None
+    assert (tracker.track.astray, tracker.track.restarts) == (astray, astray)
