@@ -31,6 +31,8 @@ SQUARE: Final = "ins: {gyro_misalignment_deg: 0, accel_misalignment_deg: 0}\ngyr
 """Inertial units whose axes are those of their boards, so that the boresight is what their gyros show."""
 AIR: Final = "flight: {buzz_deg_s: [0.5, 1.8, 1.8], gust_deg: 0.05}\ngyros: {rotor_line_deg_s: [1.0, 1.0, 0.3]}"
 """What the air and the motors do on the flights over natural scenes, for others."""
+MULTIPATH: Final = "faults: {gnss_glitch_at_s: 6, gnss_glitch_s: 8, gnss_glitch_rise_s: 3, gnss_glitch_m: [20, 0, -8]}"
+"""Positions that walk away and come back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +100,12 @@ TRIALS: Final = (
     *(Trial(f"slope {seed}", "slope", seed, 40.0) for seed in (21, 22)),
     Trial("bare field", "barefield", 21, 40.0),
     *(Trial(f"facades {seed}", "facades", seed, 40.0) for seed in (21, 22)),
+    Trial("facades, slowly", "facades", 31, 60.0, changes="flight: {speed_m_s: 3.3}"),
+    Trial("bank", "bank", 21, 40.0),
+    Trial("air, 300 rpm", "survey_fast_gyro", 82, changes=AIR + "\nlidar: {rpm: 300}"),
+    Trial("air, 1200 rpm", "survey_fast_gyro", 83, changes=AIR + "\nlidar: {rpm: 1200}"),
+    Trial("540 rpm, packets lost", "survey_slow_gyro", 81, changes="lidar: {rpm: 540}\nfaults: {lidar_loss: 0.02}"),
+    Trial("multipath", "survey_fast_gyro", 11, 24.0, changes=MULTIPATH),
     Trial("autopilot 20 ms late", "survey_slow_gyro", 51, changes="ins: {gyro_delay_s: 0.02, position_delay_s: 0.2}"),
 )  # fmt: skip
 
