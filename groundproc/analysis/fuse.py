@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flightlog.errors import GeodesyError
+from flightlog.errors import CoverageError, GeodesyError
 from groundproc.analysis.placesearch import Found, search
 from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
 from groundproc.cloud.merger import Merger
+from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]
@@ -85,9 +86,11 @@ def _laid(cloud: reader.Cloud, base: Array, sample: Array, what: str, searched: 
 def _sample(cloud: reader.Cloud, progress: Callable[[int], object]) -> Array:
     step = max(1, -(-cloud.points // MOST))
     parts = []
-    for chunk in reader.chunks(cloud, columns=()):
+    for chunk in reader.chunks(replace(cloud, choices=(SURFACES,)), columns=()):
         parts.append(chunk.points.xyz_m[::step])
         progress(len(chunk.points))
+    if not parts:
+        raise CoverageError(f"{cloud.path}: all its points are classed as noise or as what moves")
     return np.concatenate(parts)
 
 

@@ -24,7 +24,18 @@ from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.analysis.terrain.water import read_water
 from groundproc.cloud import classes as table
 from groundproc.cloud import reader
-from groundproc.cloud.classes import BUILDING, GROUND, HIGH, HIGH_NOISE, LOW, LOW_NOISE, MEDIUM, UNCLASSIFIED, WATER
+from groundproc.cloud.classes import (
+    BUILDING,
+    GROUND,
+    HIGH,
+    HIGH_NOISE,
+    LOW,
+    LOW_NOISE,
+    MEDIUM,
+    MOVING,
+    UNCLASSIFIED,
+    WATER,
+)
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -38,7 +49,9 @@ from groundproc.vectors.features import Features, write_features
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
-NAMES: Final = {kind: table.NAMES[kind] for kind in (GROUND, LOW, MEDIUM, HIGH, BUILDING, LOW_NOISE, WATER, HIGH_NOISE)}
+NAMES: Final = {
+    kind: table.NAMES[kind] for kind in (GROUND, LOW, MEDIUM, HIGH, BUILDING, LOW_NOISE, WATER, HIGH_NOISE, MOVING)
+}
 _LOW_M, _MEDIUM_M = 0.5, 2.0
 """Tops of low and of medium vegetation."""
 _GRASS_M: Final = 0.1
@@ -211,6 +224,8 @@ def work(task: Task, progress: Progress) -> Made:
         with Rewriter(cloud, aside, compressed, ("classification", "hag")) as out:
             for record, xyz, noise in area.floor.pieces():
                 hag, kind = area.classes(xyz, noise)
+                if noise.any():  # what moves stays what it is; noise may be above the ground or below it
+                    kind[np.asarray(record.classification) == MOVING] = MOVING
                 area.made.classes.update(dict(zip(*_counted(kind), strict=True)))
                 out.write(record, columns={"classification": kind, "hag": hag})
     if not area.made.classes[GROUND]:

@@ -11,6 +11,7 @@ import shapely
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.classes import NO_SURFACE
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Grid, Window
 from groundproc.raster.sampling import bilinear
@@ -18,8 +19,6 @@ from groundproc.raster.sampling import bilinear
 Array = npt.NDArray[np.float64]
 
 MOST_STATIONS: Final = 1_000_000
-_NOISE: Final = (7, 18)
-"""Classes that are no surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +140,7 @@ def of_cloud(
     lines : sequence of Line
     width_m : float
     classes : sequence of int, optional
-        Only points of these; default: all but noise.
+        Only points of these; default: all but noise and what moves.
     progress : callable
         Told of points done.
 
@@ -163,7 +162,7 @@ def of_cloud(
         xyz = chunk.points.xyz_m
         if classed:
             kind = chunk.points["classification"]
-            xyz = xyz[np.isin(kind, classes) if classes is not None else ~np.isin(kind, _NOISE)]
+            xyz = xyz[np.isin(kind, classes) if classes is not None else ~np.isin(kind, NO_SURFACE)]
         for each in sums:
             each.add(xyz, width_m)
         progress(len(chunk.points.xyz_m))

@@ -14,6 +14,7 @@ from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis import voxelsight
 from groundproc.analysis.viewshed import EXACT, FAST, UNKNOWN, VISIBLE, Sight, bend_per_m, height_at, viewshed
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
 from groundproc.raster.cells import Cells
@@ -148,14 +149,15 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
             heights = raster.window(raster.grid)
             return Surface(heights, raster.west_m, raster.north_m, raster.grid, raster.crs)
     cell_m = checked_cell(task.cell_m or _CELL_M)
-    cloud = reader.look(task.source)
+    cloud = reader.look(task.source, SURFACES)
     crs, warnings = common_crs([cloud], None)
     cells = Cells(cell_m, {"max"})
     for chunk in reader.chunks(cloud, columns=()):
         cells.add(chunk.points.xyz_m, chunk.points.xyz_m[:, 2])
         progress(len(chunk.points))
     grid = cells.grid()
-    assert grid is not None
+    if grid is None:
+        raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
     _check_size(grid)
     heights = filled(cells.window(grid, "max"), max(round(_GAP_M / cell_m), 1))
     return Surface(heights, grid.west_m, grid.north_m, grid, crs, warnings)

@@ -27,6 +27,7 @@ from groundproc.analysis.volume import (
 )
 from groundproc.cloud import reader
 from groundproc.cloud.classes import GROUND
+from groundproc.cloud.selection import SURFACES
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Window
 from groundproc.vectors.features import names_of, read_features
@@ -67,7 +68,7 @@ def measure(
     UsageError, CaptureError, GeodesyError, CoverageError
         A file is not as it should be, or not one polygon can be measured.
     """
-    cloud = reader.look(cloud_path)
+    cloud = reader.look(cloud_path, SURFACES)
     features = read_features(polygons_path, "Polygon")
     if cloud.horizontal is not None and features.crs is not None:
         features = features.into(cloud.horizontal)

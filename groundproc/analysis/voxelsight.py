@@ -14,6 +14,7 @@ from numba import njit
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.radiometry import sensorpath
 from groundproc.raster import geotiff
@@ -40,13 +41,15 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
     if task.source.suffix.lower() in (".tif", ".tiff"):
         raise UsageError(f"{task.source}: is a raster; --mode voxels looks through a cloud")
     edge_m = checked_cell(task.cell_m or _EDGE_M)
-    cloud = reader.look(task.source)
+    cloud = reader.look(task.source, SURFACES)
     crs, warnings = common_crs([cloud], None)
     path = None if task.trajectory is None else sensorpath.flown([cloud], task.trajectory)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for chunk in reader.chunks(cloud, columns=()):
         low, high = np.minimum(low, chunk.points.xyz_m.min(axis=0)), np.maximum(high, chunk.points.xyz_m.max(axis=0))
         progress(len(chunk.points))
+    if not np.isfinite(low).all():
+        raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
     first = np.floor(low / edge_m).astype(np.int64)
     shape = np.floor(high / edge_m).astype(np.int64) - first + 1
     if int(np.prod(shape)) > _MOST:

@@ -10,6 +10,7 @@ from flightlog.errors import CoverageError
 from groundproc.assessment import checkpoints, pairs
 from groundproc.assessment.figures import figures, table
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 
 
 def of_pairs(path: Path) -> tuple[dict[str, Any], str]:
@@ -39,7 +40,7 @@ def of_cloud(
     CoverageError
         Not one point could be compared.
     """
-    cloud = reader.look(cloud_path)
+    cloud = reader.look(cloud_path, SURFACES)
     points = checkpoints.read_points(points_path)
     near = checkpoints.around(cloud, points, checkpoints.REACH_M, progress)
     compared, unmatched = checkpoints.compare(points, near, mode)

@@ -124,7 +124,7 @@ def look(path: Path, *choices: Choice) -> Cloud:
 def chunks(
     cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None, selection: Selection | None = None
 ) -> Iterator[Chunk]:
-    """All points of a file that are wanted.
+    """All points of a file that are wanted; no piece is empty where some are not.
 
     Parameters
     ----------
@@ -159,7 +159,8 @@ def chunks(
             wanted = selection.mask(points)
             if wanted is not None:
                 points, record = points.masked(wanted), record[wanted]
-            yield Chunk(_only(points, asked), record)
+            if len(points) or not selection.choices:
+                yield Chunk(_only(points, asked), record)
         if seen != cloud.points:
             raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
 

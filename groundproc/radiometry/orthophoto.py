@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
 from groundproc.raster.cells import Cells
@@ -57,7 +58,7 @@ def orthophoto(
         The clouds have no such attribute, differ in their CRS, or cannot be read.
     """
     checked_cell(cell_m)
-    clouds = [reader.look(path) for path in paths]
+    clouds = [reader.look(path, SURFACES) for path in paths]
     common, warnings = common_crs(clouds, crs)
     for cloud in clouds:
         if attribute not in cloud.columns:
