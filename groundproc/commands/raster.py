@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tiles", type=float, metavar="M", help="side of tiles [m]: -o is a folder then, with an index (.vrt)"
     )
     parser.add_argument(
-        "--all-classes", action="store_true", help="noise and what moves (classes 7, 18 and 64) count too"
+        "--all-classes", action="store_true", help="noise and what moves (classes 7, 18 and 69) count too"
     )
     parser.add_argument("--crs", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
     parser.add_argument(
@@ -59,6 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
         made = work(task, bar.update)
     for line in made.warnings:
         print(f"swath: warning: {line}", file=sys.stderr)
-    left = f"; {made.left_out:,} points of classes 7, 18 and 64 left out" if made.left_out else ""
+    left = f"; {made.left_out:,} points of classes 7, 18 and 69 left out" if made.left_out else ""
     print(f"{made.columns} x {made.rows} cells of {made.cell_m:g} m in {arguments.output}{left}")
     return 0

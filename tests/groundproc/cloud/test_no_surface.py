@@ -1,4 +1,4 @@
-"""Noise and what moves (classes 7, 18, 64) change nothing in what the commands say of surfaces: with them and without them, the same."""
+"""Noise and what moves (classes 7, 18, 69) change nothing in what the commands say of surfaces: with them and without them, the same."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ import shapely
 from groundproc.cli import main
 
 EAST, NORTH = 533_000.0, 6_472_000.0
-JUNK = (7, 18, 64)
+JUNK = (7, 18, 69)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_rasters_are_those_of_the_clean_cloud(
             found.append((raster.bounds, raster.read(1)))
     assert found[0][0] == found[1][0]
     np.testing.assert_array_equal(found[0][1], found[1][1])
-    assert "6,000 points of classes 7, 18 and 64 left out" in capsys.readouterr().out
+    assert "6,000 points of classes 7, 18 and 69 left out" in capsys.readouterr().out
 
 
 def test_all_classes_count_where_they_are_asked_for(folder: Path, tmp_path: Path) -> None:
@@ -114,5 +114,5 @@ def test_the_ground_is_that_of_the_clean_cloud_and_what_moves_stays_so(folder: P
     given = np.asarray(laspy.read(folder / "dirty.laz").classification)
     same = np.asarray(dirty.classification)[: len(clean.points)] == np.asarray(clean.classification)
     assert same.all()
-    assert (np.asarray(dirty.classification)[given == 64] == 64).all()
+    assert (np.asarray(dirty.classification)[given == 69] == 69).all()
     assert np.isin(np.asarray(dirty.classification)[np.isin(given, [7, 18])], [7, 18]).all()

@@ -15,7 +15,7 @@ UTC_NS = 1_777_629_720_000_000_000  # 2026-05-01T10:02:00Z
 def points(count: int = 1000) -> Points:
     rng = np.random.default_rng(1)
     columns = {
-        "classification": rng.choice(np.array([1, 2, 7, 18, 64], np.uint8), count),
+        "classification": rng.choice(np.array([1, 2, 7, 18, 69], np.uint8), count),
         "point_source_id": rng.integers(1, 6, count).astype(np.uint16),
     }
     return Points(UTC_NS + np.arange(count) * 10**9, rng.uniform(0, 100, (count, 3)), columns)
