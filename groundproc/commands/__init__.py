@@ -15,7 +15,7 @@ CHAPTERS: Final = {
     "what people fly for": (
         "ground", "trees", "wires", "pipes", "windows", "detect", "change", "viewshed", "passability", "reflectance", "orthophoto",
     ),
-    "images": ("images", "colour", "ortho", "ndvi", "wide", "drape"),
+    "images": ("images", "colour", "ortho", "ndvi", "wide", "mesh", "drape"),
     "this computer": ("warmup", "completion"),
 }  # fmt: skip
 """How `swath --help` and docs/commands.md group them; a command of another package is listed at the end."""

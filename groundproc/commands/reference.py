@@ -21,7 +21,7 @@ READ_ON: Final = {
     "simulate": "simulator.md", "tile": "clouds.md#tiles", "tin": "clouds.md#triangles-for-design-and-machine-control",
     "trees": "uses/trees.md",
     "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
-    "warmup": "install.md#on-the-ground-compile-once", "wide": "imagery.md",
+    "warmup": "install.md#on-the-ground-compile-once", "mesh": "imagery.md", "wide": "imagery.md",
     "windows": "uses/windows.md",
     "wires": "uses/wires.md",
 }  # fmt: skip
