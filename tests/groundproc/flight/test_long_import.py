@@ -20,7 +20,8 @@ sys.exit(code)
 def measured(*words: object) -> tuple[str, float]:
     """Standard output and peak memory [MB] of a command in a process of its own."""
     command = [sys.executable, "-c", MEASURE, *map(str, words)]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode in (0, 3), run.stderr  # a log without an autopilot is doubtful
     return run.stdout, int(run.stderr.splitlines()[-1]) / 1024
 
 
