@@ -169,7 +169,10 @@ class AttributeSettings:
 
 @dataclass(frozen=True)
 class TrimSettings:
-    """Trim: which part of the flight goes into the products; what is left out is counted, and still tells of what is around it."""
+    """Trim: which part of the flight goes into the products; what is left out is counted.
+
+    What is left out still tells of what is around it.
+    """
 
     times: tuple[str, ...] | None = setting(
         None,

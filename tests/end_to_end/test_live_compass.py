@@ -14,6 +14,7 @@ from groundproc.accuracy.alignment import best_rigid
 from groundproc.cli import main
 from groundproc.estimation.odometry.tracker import LOST_M
 from groundproc.trajectory.table import read_trajectory
+from groundproc.verdict import POSITION_M
 
 COMPASS_OFF_DEG = 6.0
 GNSS_SIGMA_M = 1.0
@@ -62,10 +63,10 @@ def test_a_compass_that_is_off_is_no_lost_way(tmp_path: Path, street: Any, capsy
     out, processed = tmp_path / "live", tmp_path / "processed"
     assert main(["live", "--follow", str(street.log), "--port", "0", "--json", "-o", str(out)]) == 0
     status = json.loads([line for line in capsys.readouterr().out.splitlines() if line.startswith("{")][-1])
-    # doubtful, for half of the packets are missing, and for nothing else
+    # doubtful, for half of the packets are missing, and for where the far end lies: the map has the compass's axes
     assert main(["process", str(street.log), "--method", "adjusted", "--causal", "-o", str(processed), "--json"]) == 3
     told = json.loads(capsys.readouterr().out)
-    assert [reason["about"] for reason in told["verdict_reasons"]] == ["lost_packets"]
+    assert [reason["about"] for reason in told["verdict_reasons"]] == ["position", "lost_packets"]
     assert told["adjusted"]["restarts"] == 0
     table = np.asarray(np.genfromtxt(out / "trajectory_live.csv", delimiter=",", names=True, dtype=None))
     time_ns = table["utc_ns"].astype(np.int64)
@@ -75,6 +76,11 @@ def test_a_compass_that_is_off_is_no_lost_way(tmp_path: Path, street: Any, capsy
     poses, covered = read_trajectory(processed / "trajectory.csv").where_covered(time_ns)
     causal = Compared(street.poses_file, time_ns[covered], poses.position_m[covered])
     assert live.way_m > 200.0
+    off_m = np.linalg.norm(
+        poses.position_m[covered][-1]
+        - read_trajectory(street.poses_file).where_covered(time_ns[covered][-1:])[0].position_m[-1]
+    )
+    assert POSITION_M[0] < off_m < 3.0 * max(told["trajectory"]["largest_sigma_m"][:2])
     # the map lies on the compass's axes; at the end the fixes are beside it by more than what is taken for lost
     for each in (live, causal):
         assert each.turn_deg == pytest.approx(COMPASS_OFF_DEG, abs=1.5)

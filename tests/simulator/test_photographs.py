@@ -139,6 +139,8 @@ def test_the_autopilot_notes_each_exposure_on_the_link_and_on_its_card(flown: tu
     rows = []
     while (message := card.recv_match(type="CAM")) is not None:
         rows.append(message)
+    card.data_map.close()
+    card.filehandle.close()
     boot_us = [int(simulation.clocks.boot.shows_ns(e.time_s + 0.02)) // 1000 for e in wanted]
     assert [row.TimeUS for row in rows] == boot_us
 

@@ -75,10 +75,14 @@ def loose(track: Track) -> Mask:
 
 
 def holds_somewhere(track: Track) -> bool:
-    """Whether there is a stretch long enough to be worth keeping in which the lidar tells the way, but perhaps for one direction."""
+    """Whether there is a stretch long enough to be worth keeping in which the lidar tells the way, but perhaps for one direction.
+
+    Of a flight of few seconds, half of what counts is long enough.
+    """
+    least = min(KEPT, max(len(track.matched) - START, 0) // 2)
     ends = np.concatenate([[True], loose(track), [True]])
     ends[1 : START + 1] = True
-    return bool(np.diff(np.flatnonzero(ends)).max(initial=0) > KEPT)
+    return bool(np.diff(np.flatnonzero(ends)).max(initial=0) > least)
 
 
 def _silent(track: Track) -> Mask:

@@ -24,6 +24,11 @@ TYPED = {
     "boresight_sigma_deg": (["--boresight-sigma-deg", "0.1"], 0.1), "crs": (["--epsg", "EPSG:3006"], "EPSG:3006"),
     "crs_anyway": (["--crs-anyway"], True), "height": (["--height", "relative"], "relative"), "geoid": (["--geoid", "29.35"], "29.35"),
     "products": (["--products", "cloud.laz, pictures"], ("cloud.laz", "pictures")),
+    "times": (["--times", "10/60"], ("10/60",)), "area": (["--area", "a.gpkg"], "a.gpkg"),
+    "area_keeps": (["--area-keeps", "outside"], "outside"), "without_turns": (["--without-turns"], True),
+    "without_ends": (["--without-ends"], True), "images": (["--images", "dcim"], "dcim"), "rig": (["--rig", "r.yaml"], "r.yaml"),
+    "image_times": (["--image-times", "t.csv"], "t.csv"), "panels": (["--panels", "p.csv"], "p.csv"),
+    "ortho_gsd_m": (["--ortho-gsd-m", "0.1"], 0.1),
     "uses": (["--uses", "ground, trees"], ("ground", "trees")), "targets": (["--targets", "t.gpkg"], "t.gpkg"),
 }  # fmt: skip
 

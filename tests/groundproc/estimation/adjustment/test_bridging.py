@@ -184,3 +184,10 @@ def test_a_few_seconds_that_hold_are_worth_keeping(held: int, kept: bool) -> Non
     for column, value in ((track.unheld_m, 0.01), (track.next_unheld_m, 0.01), (track.matched, 500)):
         column[100 : 100 + held] = [value] * held
     assert holds_somewhere(track) is kept
+
+
+@pytest.mark.parametrize(("blind", "kept"), [(0, True), (10, True), (20, False)])
+def test_of_a_flight_of_four_seconds_half_of_what_counts_is_long_enough(blind: int, kept: bool) -> None:
+    track = seen(38, 0.01, 0.01, matched=500)
+    track.matched[START : START + blind] = [0] * blind
+    assert holds_somewhere(track) is kept
