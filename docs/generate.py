@@ -250,8 +250,7 @@ def survey_page() -> str:
         assert section.__doc__ is not None
         title, _, about = section.__doc__.splitlines()[0].partition(": ")
         parts += [f"\n## {title}\n", f"{about[0].upper()}{about[1:]}\n"]
-        parts += ["| key | command line | default | what it is |", "|---|---|---|---|"]
-        parts += [_option_row(field) for field in dataclasses.fields(section)]
+        parts += [_option_item(field) for field in dataclasses.fields(section)]
     parts += [
         "",
         "## Method dynamic",
@@ -266,17 +265,18 @@ def survey_page() -> str:
     return "\n".join(parts)
 
 
-def _option_row(field: "dataclasses.Field[Any]") -> str:
+def _option_item(field: "dataclasses.Field[Any]") -> str:
+    """An item of a list, which wraps; a table would not."""
     command, value = command_of(field), default_of(field)
     flag = isinstance(value, bool)
     words = ", ".join(f"`{word}{'' if flag else f' {_value_name(field)}'}`" for word in command.words)
-    default = "see below" if dataclasses.is_dataclass(value) else f"`{value_text(value)}`"
-    return f"| `{field.name}` | {words or 'not there'} | {default} | {_cell(field)} |"
+    default = "see below" if dataclasses.is_dataclass(value) else f"default `{value_text(value)}`"
+    return f"- `{field.name}` ({'; '.join(filter(None, (words, default)))}): {field.metadata['about']}{_bounds(field)}"
 
 
 def _value_name(field: "dataclasses.Field[Any]") -> str:
     choices = field.metadata.get("choices")
-    return "\\|".join(choices) if choices else command_of(field).metavar
+    return "|".join(choices) if choices else command_of(field).metavar
 
 
 def _nested_rows(options: Any, above: str) -> list[str]:
@@ -291,14 +291,19 @@ def _nested_rows(options: Any, above: str) -> list[str]:
 
 
 def _cell(field: "dataclasses.Field[Any]") -> str:
-    """What an option is, its choices and its bounds."""
-    about, rules = field.metadata["about"], field.metadata
+    """What an option is, its choices and its bounds, in a table."""
+    return f"{field.metadata['about']}{_bounds(field)}".replace("|", "\\|")
+
+
+def _bounds(field: "dataclasses.Field[Any]") -> str:
+    """Choices and bounds of an option, in brackets."""
+    rules, found = field.metadata, ""
     if rules.get("choices"):
-        about += f" ({', '.join(f'`{choice}`' for choice in rules['choices'])})"
+        found += f" ({', '.join(f'`{choice}`' for choice in rules['choices'])})"
     low, high = rules.get("minimum"), rules.get("maximum")
     if low is not None or high is not None:
-        about += f" ({'' if low is None else f'{low:g}'} to {'' if high is None else f'{high:g}'})"
-    return about.replace("|", "\\|")
+        found += f" ({'' if low is None else f'{low:g}'} to {'' if high is None else f'{high:g}'})"
+    return found
 
 
 def health_schema() -> str:

@@ -358,4 +358,5 @@ def _angles_deg(mat: Array) -> list[float]:
     sines = 0.5 * np.array([mat[2, 1] - mat[1, 2], mat[0, 2] - mat[2, 0], mat[1, 0] - mat[0, 1]])
     sine = float(np.linalg.norm(sines))
     angle = float(np.arctan2(sine, (np.trace(mat) - 1.0) / 2.0))
-    return np.degrees(sines * (angle / sine if sine > 0.0 else 1.0)).tolist()  # type: ignore[no-any-return]
+    x, y, z = np.degrees(sines * (angle / sine if sine > 0.0 else 1.0))
+    return [float(x), float(y), float(z)]

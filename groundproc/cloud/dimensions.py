@@ -133,7 +133,7 @@ TABLE: Final = (
         "number_of_returns", "u1", "number of returns", "How many echoes of the shot there are.", "sensor", field="number_of_returns",
     ),
     Dimension(
-        "classification", "u1", "class", "ASPRS class; 0 is never classified, from 64 on see docs/attributes.md#classes.", "attributes",
+        "classification", "u1", "class", "ASPRS class; from 64 on see docs/attributes.md.", "attributes",
         field="classification",
     ),
     Dimension(
@@ -190,7 +190,7 @@ TABLE: Final = (
         "views", "u1", "views", "Images that see the point, 255 at most; 0: it has no colour.", "`swath colour`",
     ),
     Dimension(
-        "spectral_class", "u1", "material by its spectrum", "Number of the material in the library of spectra, from 1; 0 is none of them.",
+        "spectral_class", "u1", "material by its spectrum", "Number in the library of spectra, from 1; 0 is none.",
         "`swath drape`",
     ),
     Dimension(

@@ -48,7 +48,7 @@ def commands_page() -> str:
             parts += ["", f"### swath {name}", "", _sentence(parser.description or module.HELP, module.HELP, name)]
             rows = [_row(action) for action in parser._actions if action.help is not argparse.SUPPRESS]
             if rows:
-                parts += ["", "| option | what it is |", "|---|---|", *rows]
+                parts += ["", *rows]
     return "\n".join([*parts, ""])
 
 
@@ -59,11 +59,11 @@ def _sentence(description: str, about: str, name: str) -> str:
 
 
 def _row(action: argparse.Action) -> str:
-    names = ", ".join(action.option_strings) or ""
-    value = "" if action.nargs == 0 else _value(action)
-    words = f"{names} {value}".strip()
+    """An item of a list, which wraps; a table would not."""
+    names = ", ".join(action.option_strings)
+    words = f"{names} {'' if action.nargs == 0 else _value(action)}".strip()
     about = (action.help or "").replace("%%", "%").replace("%(default)s", str(action.default))
-    return f"| `{words.replace('|', chr(92) + '|')}` | {about.replace('|', chr(92) + '|').replace('<', '&lt;')} |"
+    return f"- `{words}`: {about.replace('<', '&lt;')}"
 
 
 def _value(action: argparse.Action) -> str:

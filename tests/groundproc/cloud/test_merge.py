@@ -3,6 +3,7 @@
 import json
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -101,10 +102,10 @@ def test_folders_of_products_are_taken_and_a_copc_keeps_the_table(tmp_path: Path
     ],
 )
 def test_what_does_not_go_together_is_one_sentence_and_leaves_nothing(
-    other: dict[str, object], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    other: dict[str, Any], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cloud(tmp_path / "a.laz", 1, extra="f8", count=100)
-    cloud(tmp_path / "b.laz", 2, count=100, **other)  # type: ignore[arg-type]
+    cloud(tmp_path / "b.laz", 2, count=100, **other)
     assert main(["merge", str(tmp_path / "a.laz"), str(tmp_path / "b.laz"), "-o", str(tmp_path / "o.laz")]) == 1
     said = capsys.readouterr().err
     assert told in said

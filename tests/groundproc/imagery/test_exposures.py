@@ -3,6 +3,7 @@
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,11 +75,11 @@ def test_two_cameras_on_one_trigger_expose_together(flown: tuple[Path, Simulatio
     np.testing.assert_array_equal(timed.utc_ns, np.tile(both, 2))
 
 
-def tlog(path: Path, messages: list[object]) -> Path:
+def tlog(path: Path, messages: list[Any]) -> Path:
     packer = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
     data = b""
     for n, message in enumerate(messages):
-        data += struct.pack(">Q", 1_700_000_000_000_000 + n * 1000) + message.pack(packer)  # type: ignore[attr-defined]
+        data += struct.pack(">Q", 1_700_000_000_000_000 + n * 1000) + message.pack(packer)
     path.write_bytes(data)
     return path
 
