@@ -13,8 +13,7 @@ from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.classes import NO_SURFACE
 from groundproc.raster import geotiff
-from groundproc.raster.grid import Grid, Window
-from groundproc.raster.sampling import bilinear
+from groundproc.raster.sampling import heights_at
 
 Array = npt.NDArray[np.float64]
 
@@ -95,38 +94,15 @@ def line_of(name: str, places_m: Array, step_m: float) -> Line:
 
 
 def of_raster(path: Path, lines: Sequence[Line]) -> list[Profile]:
-    """Heights of a raster at the stations, bilinear between the centres of cells; NaN outside.
+    """Heights of a raster at the stations, bilinear between the centres of cells; NaN outside and beside unknown cells.
 
     Raises
     ------
     CaptureError
         It cannot be read.
     """
-    found = []
     with geotiff.opened(path) as raster:
-        for line in lines:
-            found.append(Profile(line, path.name, _sampled(raster, line.stations_m)))
-    return found
-
-
-def _sampled(raster: geotiff.Raster, xy_m: Array) -> Array:
-    """Piece by piece, so that a long line does not need the whole raster at once."""
-    grid, out = raster.grid, np.full(len(xy_m), np.nan)
-    column = (xy_m[:, 0] - raster.west_m) / grid.cell_m
-    down = (raster.north_m - xy_m[:, 1]) / grid.cell_m
-    within = (column >= 0) & (column < grid.columns) & (down >= 0) & (down < grid.rows)
-    tile = np.floor(np.column_stack([column, down]) / geotiff.BLOCK).astype(np.int64)
-    for key in np.unique(tile[within], axis=0):
-        some = within & (tile == key).all(axis=1)
-        left, top = key * geotiff.BLOCK - 1
-        side = geotiff.BLOCK + 2
-        values = raster.window(Window(grid.column + left, grid.row + grid.rows - top - side, side, side))
-        # in cells from the window's own corner, so that no grid of whole multiples is needed
-        local = np.column_stack([column[some] - left, side - (down[some] - top)])
-        frame = Grid(0, 0, side, side, 1.0)
-        inside = np.isfinite(values[np.floor(side - local[:, 1]).astype(int), np.floor(local[:, 0]).astype(int)])
-        out[some] = np.where(inside, bilinear(values, frame, local), np.nan)
-    return out
+        return [Profile(line, path.name, heights_at(raster, line.stations_m)) for line in lines]
 
 
 def of_cloud(

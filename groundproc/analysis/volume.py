@@ -113,29 +113,36 @@ class Plane:
         return self._sigma_m
 
 
-class Toe:
-    """Triangles through the heights of the edge."""
+class _Triangles:
+    """Triangles through places, shape (n, 3); outside of all the height of the nearest place."""
 
-    def __init__(self, edge_m: Array, sigma_m: Array) -> None:
-        self._linear = LinearNDInterpolator(edge_m[:, :2], edge_m[:, 2])
-        self._nearest = NearestNDInterpolator(edge_m[:, :2], edge_m[:, 2])
-        rough = np.diff(edge_m[:, 2], n=2) / np.sqrt(6.0)  # what neighbours along the edge do not agree in
-        self._sigma_m = _mean_sigma(edge_m, np.sqrt(np.mean(rough**2) + np.mean(sigma_m**2)))
+    def __init__(self, places_m: Array) -> None:
+        self._linear = LinearNDInterpolator(places_m[:, :2], places_m[:, 2])
+        self._nearest = NearestNDInterpolator(places_m[:, :2], places_m[:, 2])
 
     def heights(self, xy_m: Array) -> Array:
-        """See `Base`; a place on the edge itself takes the height of the nearest of its heights."""
+        """See `Base`; a place on the rim itself takes the height of the nearest place."""
         found = np.asarray(self._linear(xy_m))
         beyond = ~np.isfinite(found)
         if beyond.any():
             found[beyond] = self._nearest(xy_m[beyond])
         return found
 
+
+class Toe(_Triangles):
+    """Triangles through the heights of the edge."""
+
+    def __init__(self, edge_m: Array, sigma_m: Array) -> None:
+        super().__init__(edge_m)
+        rough = np.diff(edge_m[:, 2], n=2) / np.sqrt(6.0)  # what neighbours along the edge do not agree in
+        self._sigma_m = _mean_sigma(edge_m, np.sqrt(np.mean(rough**2) + np.mean(sigma_m**2)))
+
     def sigma_m(self) -> float:
         """From the roughness of the edge."""
         return self._sigma_m
 
 
-class Terrain:
+class Terrain(_Triangles):
     """The bare ground within and around, filled where something stands on it: triangles through means of small cells.
 
     Parameters
@@ -161,8 +168,7 @@ class Terrain:
         places = np.column_stack([_centres(grid)[known.ravel()], heights[known]])
         if len(places) < _LEAST_CELLS or np.ptp(places[:, :2], axis=0).min() <= 0.0:
             raise ValueError("too little ground")
-        self._linear = LinearNDInterpolator(places[:, :2], places[:, 2])
-        self._nearest = NearestNDInterpolator(places[:, :2], places[:, 2])
+        super().__init__(places)
         # every other cell from the rest: what triangles do not know of the ground between
         odd = np.arange(len(places)) % 2 == 1
         rest = np.asarray(LinearNDInterpolator(places[~odd, :2], places[~odd, 2])(places[odd, :2]))
@@ -171,14 +177,6 @@ class Terrain:
         # under the thing itself there may be no ground: it rests on what lies along its edge
         edge = np.asarray(polygon.exterior.coords)[:-1, :2]
         self._sigma_m = _mean_sigma(edge, rough)
-
-    def heights(self, xy_m: Array) -> Array:
-        """See `Base`."""
-        found = np.asarray(self._linear(xy_m))
-        beyond = ~np.isfinite(found)
-        if beyond.any():
-            found[beyond] = self._nearest(xy_m[beyond])
-        return found
 
     def sigma_m(self) -> float:
         """From the roughness of the ground."""

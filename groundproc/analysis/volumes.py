@@ -29,7 +29,7 @@ from groundproc.cloud import reader
 from groundproc.cloud.classes import GROUND
 from groundproc.cloud.selection import SURFACES
 from groundproc.raster import geotiff
-from groundproc.raster.grid import Window
+from groundproc.raster.sampling import heights_at
 from groundproc.vectors.features import names_of, read_features
 
 Array = npt.NDArray[np.float64]
@@ -138,22 +138,5 @@ def _one(name: str, polygon: Any, points_m: Array, ground_m: Array, base: str) -
         found = volume(polygon, points_m, below)
     else:
         with geotiff.opened(Path(base)) as raster:
-            found = volume(polygon, points_m, Known(lambda xy: bilinear(raster, xy)))
+            found = volume(polygon, points_m, Known(lambda xy: heights_at(raster, xy)))
     return Measured(name, None, found) if isinstance(found, str) else Measured(name, found, "")
-
-
-def bilinear(raster: geotiff.Raster, xy_m: Array) -> Array:
-    """Heights of a raster between the centres of its cells, shape (n, 2) -> (n,); NaN beside unknown cells."""
-    grid = raster.grid
-    column = (xy_m[:, 0] - raster.west_m) / grid.cell_m - 0.5
-    down = (raster.north_m - xy_m[:, 1]) / grid.cell_m - 0.5
-    left, top = int(np.floor(column.min())), int(np.floor(down.min()))
-    width, height = int(np.floor(column.max())) - left + 2, int(np.floor(down.max())) - top + 2
-    window = Window(grid.column + left, grid.row + grid.rows - top - height, width, height)
-    values = raster.window(window).astype(np.float64)
-    i, j = np.floor(column).astype(int) - left, np.floor(down).astype(int) - top
-    u, v = column - left - i, down - top - j
-    return np.asarray(
-        (1 - v) * ((1 - u) * values[j, i] + u * values[j, i + 1])
-        + v * ((1 - u) * values[j + 1, i] + u * values[j + 1, i + 1])
-    )

@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.raster.grid import Grid
+from groundproc.raster import geotiff
+from groundproc.raster.grid import Grid, Window
 
 Array = npt.NDArray[np.float64]
 
@@ -43,4 +44,39 @@ def _bilinear(values: Any, west: float, north: float, cell: float, xyz: Any) -> 
                 total += w * value
                 weight += w
         out[n] = total / weight if weight > 0.0 else np.nan
+    return out
+
+
+def heights_at(raster: geotiff.Raster, xy_m: Array) -> Array:
+    """Values of a file between the centres of its cells, shape (n,); NaN outside, and beside cells that are not known.
+
+    Read a block of cells at a time, so that a long line does not need the whole raster at once.
+
+    Parameters
+    ----------
+    raster : Raster
+    xy_m : ndarray, shape (n, 2)
+
+    Raises
+    ------
+    CaptureError
+        The file is damaged.
+    """
+    grid, out = raster.grid, np.full(len(xy_m), np.nan)
+    column = (xy_m[:, 0] - raster.west_m) / grid.cell_m - 0.5
+    down = (raster.north_m - xy_m[:, 1]) / grid.cell_m - 0.5
+    within = (column > -1.0) & (column < grid.columns) & (down > -1.0) & (down < grid.rows)
+    block = np.floor(np.column_stack([column, down]) / geotiff.BLOCK)
+    side = geotiff.BLOCK + 1
+    for key in np.unique(block[within], axis=0).astype(np.int64):
+        some = within & (block == key).all(axis=1)
+        left, top = key * geotiff.BLOCK
+        values = raster.window(Window(grid.column + left, grid.row + grid.rows - top - side, side, side)).astype(
+            np.float64
+        )
+        i, j = np.floor(column[some]).astype(int) - left, np.floor(down[some]).astype(int) - top
+        u, v = column[some] - left - i, down[some] - top - j
+        out[some] = (1 - v) * ((1 - u) * values[j, i] + u * values[j, i + 1]) + v * (
+            (1 - u) * values[j + 1, i] + u * values[j + 1, i + 1]
+        )
     return out
