@@ -51,7 +51,7 @@ class _ShowConfig(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from flightlog import config
-        from groundproc.flight.positions.ppk import PpkOptions
+        from groundproc.flight.positions.ppkoptions import PpkOptions
 
         print(config.dump(PpkOptions()), end="")
         parser.exit()
@@ -64,7 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
     from flightlog.errors import UsageError
     from groundproc.commands.inputs import expect, expect_text
     from groundproc.commands.outputs import claim_file
-    from groundproc.flight.positions.ppk import Base, base_position, process
+    from groundproc.flight.positions.ppk import process
+    from groundproc.flight.positions.ppkoptions import Base, base_position
 
     if arguments.base_position is not None and arguments.base_average:
         raise UsageError("--base-position and --base-average: one of the two")
@@ -94,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _options(arguments: argparse.Namespace) -> Any:
     """The options of the file with those of the command line before them."""
     from flightlog import config
-    from groundproc.flight.positions.ppk import PpkOptions
+    from groundproc.flight.positions.ppkoptions import PpkOptions
 
     options = config.load(arguments.config, PpkOptions) if arguments.config else PpkOptions()
     named = {

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 
 from groundproc.cli import main
-from groundproc.flight.positions.ppk import PpkOptions
+from groundproc.flight.positions.ppkoptions import PpkOptions
 from groundproc.flight.positions.reading import read_solution
 from groundproc.flight.positions.solution import Quality, Solution
 
