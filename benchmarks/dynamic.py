@@ -43,8 +43,9 @@ from groundproc.estimation.dynamic.trims import applied, interpolated
 from groundproc.estimation.method import Given, gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
+from groundproc.flight.pairing import legs
 from groundproc.flight.shots import shots
-from groundproc.flight.timeline import Leg, legs
+from groundproc.flight.timeline import Leg
 from groundproc.sensors.shots import Gate
 from groundproc.survey import Survey
 from groundproc.survey.dynamic import ROBUST, SOURCE, DynamicOptions

@@ -34,15 +34,16 @@ from machine import busy_s
 from flightlog.errors import SwathError
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
-from groundproc.accuracy.cloud import Section, choose_section
+from groundproc.accuracy.cloud import choose_section
+from groundproc.accuracy.cloudfigures import Section
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import Clock, Truth, on_lidar_clock, read_truth
 from groundproc.estimation import methods
 from groundproc.estimation.method import gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
+from groundproc.flight.pairing import legs
 from groundproc.flight.sync.result import Sync
-from groundproc.flight.timeline import legs
 from groundproc.sensors.shots import LaserTable
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory

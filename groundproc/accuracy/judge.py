@@ -13,7 +13,8 @@ from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy import poses
 from groundproc.accuracy.alignment import align
-from groundproc.accuracy.cloud import CloudErrors, Section, judge_cloud
+from groundproc.accuracy.cloud import judge_cloud
+from groundproc.accuracy.cloudfigures import CloudErrors, Section
 from groundproc.accuracy.truth import Truth
 from groundproc.sensors.shots import LaserTable
 from groundproc.trajectory.trajectory import Trajectory

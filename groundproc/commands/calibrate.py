@@ -119,7 +119,7 @@ def _adjusted(path: Path, nominal: Any, with_lasers: bool, progress: Any) -> Fli
     from groundproc.estimation.direct import ins_estimate
     from groundproc.estimation.method import gather
     from groundproc.flight.flight import read_flight
-    from groundproc.flight.timeline import legs
+    from groundproc.flight.pairing import legs
     from groundproc.sensors.lasers import ESTIMATE
     from groundproc.survey import Survey
 

@@ -9,8 +9,9 @@ from typing import Any, Final
 
 from flightlog.errors import SyncError
 from groundproc.flight.autopilot import Boot, Vehicle
+from groundproc.flight.pairing import likeness
 from groundproc.flight.sync import LEAST_PEAK
-from groundproc.flight.timeline import LidarRun, likeness
+from groundproc.flight.timeline import LidarRun
 
 CLEARLY: Final = 0.5
 """The best fit may leave at most this share of the motion unexplained that the next one leaves."""

@@ -11,7 +11,7 @@ from groundproc.estimation.method import gather
 from groundproc.flight.belonging import in_order_of_one_flight
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
-from groundproc.flight.timeline import legs
+from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory
 

@@ -12,7 +12,7 @@ from flightlog import nmea
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mavlink import Frame
-from groundproc.flight import timebase, timeline
+from groundproc.flight import pairing, timebase
 from groundproc.flight.load import Sentence
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import Leg, LidarRun
@@ -128,7 +128,7 @@ class _Search(threading.Thread):
             self.found = "no heartbeat of an autopilot"
             return
         try:
-            leg = timeline.legs([self._run], [boot], self._mat, self._how)[0]
+            leg = pairing.legs([self._run], [boot], self._mat, self._how)[0]
             self.found = tie_of(leg, self._mat, self._run.line.device_ns(self._run.last_receive_ns))
         except (SwathError, np.linalg.LinAlgError) as error:
             self.found = str(error)

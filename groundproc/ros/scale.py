@@ -11,8 +11,9 @@ from flightlog.errors import ClockError, SyncError
 from flightlog.mount import Mount
 from groundproc.flight import timebase
 from groundproc.flight.autopilot import Boot
+from groundproc.flight.pairing import legs
 from groundproc.flight.timebase import HostLine
-from groundproc.flight.timeline import ClockTie, LidarRun, Line, legs, tied, ties_of
+from groundproc.flight.timeline import ClockTie, LidarRun, Line, tied, ties_of
 
 Times = npt.NDArray[np.int64]
 

@@ -15,7 +15,8 @@ from groundproc.estimation.method import Progress
 from groundproc.flight.belonging import in_order_of_one_flight
 from groundproc.flight.flight import Flight, read_flight
 from groundproc.flight.mounting import find_mount
-from groundproc.flight.timeline import Leg, legs
+from groundproc.flight.pairing import legs
+from groundproc.flight.timeline import Leg
 from groundproc.steps.request import Request
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate, read_estimate

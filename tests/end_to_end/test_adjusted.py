@@ -19,7 +19,7 @@ from groundproc.estimation.adjustment import adjusted, windows
 from groundproc.estimation.method import gather
 from groundproc.estimation.odometry.track import Track
 from groundproc.flight.flight import read_flight
-from groundproc.flight.timeline import legs
+from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 

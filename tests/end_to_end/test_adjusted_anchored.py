@@ -22,7 +22,7 @@ from groundproc.estimation import methods
 from groundproc.estimation.adjustment import adjusted, windows
 from groundproc.estimation.method import Given, gather
 from groundproc.flight.flight import read_flight
-from groundproc.flight.timeline import legs
+from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 

@@ -13,7 +13,7 @@ from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
 from groundproc.estimation.method import gather
 from groundproc.flight.flight import read_flight
-from groundproc.flight.timeline import legs
+from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 

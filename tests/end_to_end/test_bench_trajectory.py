@@ -17,7 +17,7 @@ from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc.accuracy.truth import read_truth
 from groundproc.flight.flight import read_flight
-from groundproc.flight.timeline import legs
+from groundproc.flight.pairing import legs
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 KEYS = {

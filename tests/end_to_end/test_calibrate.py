@@ -19,7 +19,7 @@ from groundproc.estimation.calibration.compass import BINS, read_compass
 from groundproc.estimation.dynamic.dynamic import with_compass
 from groundproc.estimation.method import gather
 from groundproc.flight.flight import read_flight
-from groundproc.flight.timeline import legs
+from groundproc.flight.pairing import legs
 from groundproc.sensors.lasers import ESTIMATE, read_lasers
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate

@@ -14,8 +14,9 @@ from groundproc.cloud import attributes, placing
 from groundproc.cloud.points import Points
 from groundproc.flight.flight import read_flight
 from groundproc.flight.lidar import lidar_of
+from groundproc.flight.pairing import legs
 from groundproc.flight.shots import Tally, shots
-from groundproc.flight.timeline import Leg, legs, tied
+from groundproc.flight.timeline import Leg, tied
 from groundproc.sensors.shots import Gate
 from groundproc.steps.place import mount_errors
 from groundproc.survey import Survey

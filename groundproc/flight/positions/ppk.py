@@ -19,7 +19,8 @@ from groundproc.flight.positions.ppkinputs import Input, checked, prepared, stre
 from groundproc.flight.positions.ppkoptions import Base, PpkError, PpkOptions
 from groundproc.flight.positions.ppkrunning import SOLVER, run, tool
 from groundproc.flight.positions.ppksummary import comments, summary_of
-from groundproc.flight.positions.rtklib import read_pos, write_pos
+from groundproc.flight.positions.rtklib import read_pos
+from groundproc.flight.positions.rtklibwriter import write_pos
 from groundproc.flight.positions.solution import Solution
 
 Advance = Callable[[float], None]

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from flightlog import __version__
-from groundproc.flight.positions.rtklib import POINT_OF_INS, write_pos
+from groundproc.flight.positions.rtklib import POINT_OF_INS
+from groundproc.flight.positions.rtklibwriter import write_pos
 from groundproc.flight.positions.solution import ELLIPSOID, MSL, Quality
 from groundproc.trajectory.exports.source import Source
 

@@ -23,7 +23,8 @@ from groundproc.accuracy.truth import Truth, on_lidar_clock, read_truth, shot_nu
 from groundproc.estimation import methods
 from groundproc.estimation.method import gather
 from groundproc.flight.flight import read_flight
-from groundproc.flight.timeline import Line, legs
+from groundproc.flight.pairing import legs
+from groundproc.flight.timeline import Line
 from groundproc.survey import Survey
 from groundproc.trajectory.table import from_poses
 from groundproc.trajectory.trajectory import Trajectory

@@ -25,8 +25,8 @@ from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, POSIT
 from groundproc.flight import autopilot
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight
+from groundproc.flight.pairing import legs
 from groundproc.flight.positions.fixes import OutsideFixes
-from groundproc.flight.timeline import legs
 from groundproc.geodesy import LocalFrame
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory

@@ -18,7 +18,8 @@ from groundproc.flight import boardlog, merging
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight
 from groundproc.flight.mounting import find_mount
-from groundproc.flight.timeline import Leg, legs
+from groundproc.flight.pairing import legs
+from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
 from groundproc.steps.clocks import describe_leg, describe_sync
 from simulator.boardlog import Kind

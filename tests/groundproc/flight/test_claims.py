@@ -17,9 +17,9 @@ from groundproc.flight.claims import FIRST_NS, GPRMC, HOST, SYSTEM_TIME, settled
 from groundproc.flight.flight import read_flight
 from groundproc.flight.importers.tlog import TlogCount
 from groundproc.flight.importers.tlog import records as tlog_records
+from groundproc.flight.pairing import legs
 from groundproc.flight.summary.log import summarise
 from groundproc.flight.summary.telemetry import TelemetrySummary
-from groundproc.flight.timeline import legs
 from groundproc.steps.clocks import describe_leg
 
 S = 10**9

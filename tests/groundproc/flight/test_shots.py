@@ -14,8 +14,9 @@ from groundproc.cli import main
 from groundproc.field.madeup import write_flight
 from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
+from groundproc.flight.pairing import legs
 from groundproc.flight.shots import Tally, shots
-from groundproc.flight.timeline import Leg, legs
+from groundproc.flight.timeline import Leg
 from groundproc.sensors.shots import Gate
 
 MESSAGE_S = 0.1

@@ -12,7 +12,8 @@ from flightlog.logfile import LogReader, LogWriter
 from flightlog.mount import Mount
 from groundproc.flight import load
 from groundproc.flight.flight import Flight, read_flight
-from groundproc.flight.timeline import Line, legs
+from groundproc.flight.pairing import legs
+from groundproc.flight.timeline import Line
 
 S, MS = 10**9, 10**6
 MAT = Mount().mat_ins_lidar()

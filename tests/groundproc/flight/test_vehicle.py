@@ -15,9 +15,10 @@ from groundproc.cli import main
 from groundproc.flight import autopilot, timebase, vehicle
 from groundproc.flight.flight import read_flight
 from groundproc.flight.importers import tlog
+from groundproc.flight.pairing import legs
 from groundproc.flight.sharing import parted
 from groundproc.flight.sync import GyroTrack
-from groundproc.flight.timeline import LidarRun, legs
+from groundproc.flight.timeline import LidarRun
 from groundproc.steps.clocks import describe_sync
 
 FramesOf = Callable[..., list[Frame]]

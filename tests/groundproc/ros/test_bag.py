@@ -20,8 +20,8 @@ from groundproc.accuracy.truth import read_truth
 from groundproc.cli import main
 from groundproc.cloud.georeference import georeference
 from groundproc.flight.flight import read_clocks, read_flight
+from groundproc.flight.pairing import legs
 from groundproc.flight.shots import shots
-from groundproc.flight.timeline import legs
 from groundproc.ros.clouds import LONGEST_NS, clouds
 from groundproc.ros.messages import POINT, rotation_covariance
 from groundproc.sensors.hdl32e import LIDAR

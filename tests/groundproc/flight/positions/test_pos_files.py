@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from flightlog.errors import LogError
-from groundproc.flight.positions.rtklib import read_pos, write_pos
+from groundproc.flight.positions.rtklib import read_pos
+from groundproc.flight.positions.rtklibwriter import write_pos
 from groundproc.flight.positions.solution import Quality
 
 HEAD = (
