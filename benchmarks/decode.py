@@ -22,7 +22,7 @@ from flightlog import clock, hdl32e, mavlink
 from flightlog.frames import mat_local_ins, quat_from_mat
 from groundproc import sensors
 from groundproc.cloud import georeference
-from groundproc.flight import autopilot, timebase, timeline
+from groundproc.flight import autopilot, pairing, timebase
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
 from groundproc.geodesy import LocalFrame
@@ -140,7 +140,7 @@ def sync_error_ms(link: dict[str, float]) -> dict[str, float]:
         line = timebase.host_line(lidar_ns, host_ns)
         run = LidarRun(int(host_ns[0]), int(host_ns[-1]), line, gyro, ())
         boots = autopilot.boots(frames)
-        found = timeline.legs([run], boots, simulation.scene.mount.mat_ins_lidar(), "gyro")[0].sync
+        found = pairing.legs([run], boots, simulation.scene.mount.mat_ins_lidar(), "gyro")[0].sync
         clocks = simulation.clocks
         at_s = clocks.lidar.time_s(np.array([(found.reference_ns - clocks.lidar.start_ns) * 1e-9]))[0]
         truth = int(clocks.boot.shows_ns(at_s)) - int(clocks.lidar.shows_ns(at_s))
