@@ -134,6 +134,11 @@ def work(task: Task, progress: Progress) -> Made:
                 _write_walls(other, task.walls.suffix, floor, made.walls)
     if not made.walls:
         made.warnings.append("no wall of a house was found")
+    elif path is None:
+        made.warnings.append(
+            "where the beams went is not known: side walls and roofs behind a facade are taken for what is seen through it; give the "
+            "trajectory with -t"
+        )
     return made
 
 

@@ -161,6 +161,7 @@ def test_without_beams_the_outside_is_where_the_ground_is(made: tuple[Path, dict
     room = int((echoes["kind"] == ROOM).sum())
     assert figures["points_behind"] > 0.95 * room
     assert any("classes up to 31 only" in each for each in figures["warnings"])
+    assert any("give the trajectory with -t" in each for each in figures["warnings"])
 
 
 def test_a_trajectory_of_another_time_is_one_sentence(
