@@ -113,7 +113,8 @@ def _descend(
         normal = normal_of(block, known, unknowns, damping)
         trial = _stepped(block, normal, damping)
         after = np.inf if trial is None else cost(trial, known, unknowns)
-        if after <= now * (1.0 + 1e-12):
+        # at the bottom a step changes the sum of squares by its rounding alone: no damping would make it smaller
+        if after <= now * (1.0 + SETTLED):
             return trial, after, damping
         damping = max(10.0 * damping, _LEAST_DAMPING)
         if damping > _MOST_DAMPING:

@@ -12,7 +12,10 @@ from pymavlink.dialects.v20 import ardupilotmega
 from flightlog.errors import CaptureError
 from groundproc.cli import main
 from groundproc.imagery.exposures import exposures_of
-from groundproc.imagery.poses import NO_TIME
+from groundproc.imagery.poses import NO_TIME, read_poses
+from groundproc.imagery.rig import read_rig
+from groundproc.imagery.site import georeferenced
+from groundproc.imagery.tables import read_control, read_marks
 from groundproc.imagery.times import by_camera, times_of
 from simulator.cameras import CameraOptions
 from simulator.config import Options
@@ -115,3 +118,25 @@ def test_positions_without_a_log_are_refused(tmp_path: Path, capsys: pytest.Capt
     (tmp_path / "rtk.pos").write_text("")
     assert main(["images", str(tmp_path), "--positions", str(tmp_path / "rtk.pos"), "-o", str(tmp_path / "out")]) == 2
     assert "--positions: nothing uses it without a flight log" in capsys.readouterr().err
+
+
+def test_the_simulator_s_poses_rig_and_marks_agree_with_the_geometry_of_this_room(
+    flown: tuple[Path, Simulation],
+) -> None:
+    """Two lens models, two map projections and two conventions of angles, written apart, put points on the same pixels."""
+    images = flown[0] / "images"
+    poses, rig = read_poses(images / "truth" / "poses.csv"), read_rig(images / "truth" / "rig.yaml")
+    control, marks = read_control(images / "control.csv"), read_marks(images / "marks.csv")
+    site = georeferenced(32633, control.place_m)
+    place, points = site.local(poses.place_m), site.local(control.place_m)
+    mat = site.mat_local_grid(place) @ poses.mat_grid_camera()
+    image = np.array([poses.images.index(name) for name in marks.image])
+    point = np.array([control.name.index(name) for name in marks.point])
+    seen = np.einsum("nji,nj->ni", mat[image], points[point] - place[image])
+    for camera in rig.cameras:
+        own = np.array([camera.takes(name) for name in marks.image])
+        pixels, reached = camera.camera.project(seen[own])
+        assert reached.sum() > 30
+        off = (pixels - marks.pixel[own]) / marks.sigma_px[own, None]
+        assert np.abs(off.mean(axis=0)).max() < 4.0 / np.sqrt(own.sum())
+        assert np.abs(off.std(axis=0) - 1.0).max() < 4.0 / np.sqrt(2.0 * own.sum())
