@@ -3,12 +3,12 @@
 import json
 import secrets
 import threading
-from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, Final
-from urllib.parse import parse_qs, urlsplit
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Final
+from urllib.parse import SplitResult, parse_qs
 
-from flightlog.errors import SourceError, SwathError
+from flightlog.errors import SwathError
+from groundproc.loopback import Handler, Loopback
 from groundproc.viewer.edits import Edit, edits_of
 from groundproc.viewer.page import VIEWER, held, page, script_of
 from groundproc.viewer.served import Served
@@ -16,13 +16,12 @@ from groundproc.viewer.served import Served
 Save = Callable[[list[Edit]], dict[str, Any]]
 
 STYLES: Final = ("base.css", "viewer.css", "view.css")
-_NAMES: Final = ("localhost", "127.0.0.1", "[::1]")
 _MOST_BODY: Final = 32 << 20
 _TOKEN: Final = "X-Swath-Token"
 
 
-class ViewServer:
-    """Serves a cloud on the loopback interface, in threads of its own.
+class ViewServer(Loopback):
+    """Serves a cloud on the loopback interface.
 
     Parameters
     ----------
@@ -46,19 +45,7 @@ class ViewServer:
         """The edits as the page sent them, for a page that is loaded again."""
         self.unsaved = 0
         self.lock = threading.Lock()
-        viewer = self
-
-        class Handler(_Handler):
-            owner = viewer
-
-        try:
-            self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
-        except OSError as error:
-            raise SourceError(f"TCP port {port} at 127.0.0.1 cannot be opened: {error.strerror or error}") from None
-        self._server.daemon_threads = True
-        self.port = int(self._server.server_address[1])
-        self._thread = threading.Thread(target=self._server.serve_forever, name="view", daemon=True)
-        self._thread.start()
+        super().__init__(type("Handler", (_Handler,), {"owner": self}), port, "view")
 
     def page(self) -> bytes:
         """The page as it is now."""
@@ -73,37 +60,27 @@ class ViewServer:
         )
         return text.encode()
 
-    def close(self) -> None:
-        """Stop to serve."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join(5.0)
 
-
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(Handler):
     owner: ViewServer
-    protocol_version = "HTTP/1.1"
-    timeout = 30
+    headers_told: ClassVar[Mapping[str, str]] = {"X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY"}
 
-    def do_GET(self) -> None:
-        """Answer; only to who calls this machine by its own name, so that no other site's page reads along."""
-        if not self._is_ours():
-            return
-        url = urlsplit(self.path)
+    def get(self, url: SplitResult) -> None:
+        """Answer."""
         if url.path == "/":
-            self._answer(200, "text/html; charset=utf-8", self.owner.page())
+            self.answer(200, "text/html; charset=utf-8", self.owner.page())
         elif url.path == "/node":
             self._node(parse_qs(url.query).get("key", [""])[0])
         else:
-            self._answer(404, "text/plain", b"not here\n")
+            self.answer(404, "text/plain", b"not here\n")
 
-    def do_POST(self) -> None:
+    def post(self) -> None:
         """Take edits, or save; only from our own page, which knows the token."""
         body = self._body()
-        if body is None or not self._is_ours():
+        if body is None or not self.is_ours():
             return
         if not secrets.compare_digest(self.headers.get(_TOKEN) or "", self.owner.token):
-            self._answer(403, "text/plain", b"only the page of this program may change anything\n")
+            self.answer(403, "text/plain", b"only the page of this program may change anything\n")
             return
         try:
             if self.path == "/edits" and self.owner.save is not None:
@@ -111,9 +88,9 @@ class _Handler(BaseHTTPRequestHandler):
             elif self.path == "/save" and self.owner.save is not None:
                 self._told(self._save())
             else:
-                self._answer(404, "text/plain", b"not here\n")
+                self.answer(404, "text/plain", b"not here\n")
         except SwathError as error:
-            self._answer(400, "text/plain; charset=utf-8", f"{error}\n".encode())
+            self.answer(400, "text/plain; charset=utf-8", f"{error}\n".encode())
 
     def _edits(self, body: bytes) -> dict[str, Any]:
         try:
@@ -135,53 +112,27 @@ class _Handler(BaseHTTPRequestHandler):
     def _node(self, name: str) -> None:
         parts = name.split("-")
         if len(parts) != 4 or not all(part.isdecimal() and len(part) < 11 for part in parts):
-            self._answer(404, "text/plain", b"no such node\n")
+            self.answer(404, "text/plain", b"no such node\n")
             return
         level, x, y, z = map(int, parts)
         try:
             found = self.owner.served.node((level, x, y, z))
         except SwathError as error:
-            self._answer(500, "text/plain; charset=utf-8", f"{error}\n".encode())
+            self.answer(500, "text/plain; charset=utf-8", f"{error}\n".encode())
             return
         if found is None:
-            self._answer(404, "text/plain", b"no such node\n")
+            self.answer(404, "text/plain", b"no such node\n")
         else:
-            self._answer(200, "application/octet-stream", found)
-
-    def _is_ours(self) -> bool:
-        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-        if host in _NAMES:
-            return True
-        self._answer(403, "text/plain", b"this page is for this machine\n")
-        return False
+            self.answer(200, "application/octet-stream", found)
 
     def _body(self) -> bytes | None:
         """What was sent; None where it is too long to be read, and that is answered."""
         text = self.headers.get("Content-Length") or "0"
         if not text.isdecimal() or int(text) > _MOST_BODY:
             self.close_connection = True
-            self._answer(413, "text/plain", b"too long\n")
+            self.answer(413, "text/plain", b"too long\n")
             return None
         return self.rfile.read(int(text))
 
     def _told(self, value: dict[str, Any]) -> None:
-        self._answer(200, "application/json", json.dumps(value).encode())
-
-    def _answer(self, code: int, kind: str, body: bytes) -> None:
-        try:
-            self.send_response(code)
-            for name, value in {
-                "Content-Type": kind,
-                "Content-Length": str(len(body)),
-                "Cache-Control": "no-store",
-                "X-Content-Type-Options": "nosniff",
-                "X-Frame-Options": "DENY",
-            }.items():
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(body)
-        except ConnectionError:
-            self.close_connection = True
-
-    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base class calls it so
-        """Say nothing: the terminal is the command's."""
+        self.answer(200, "application/json", json.dumps(value).encode())
