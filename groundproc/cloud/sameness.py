@@ -28,6 +28,33 @@ def agreed_crs(clouds: Sequence[Cloud]) -> pyproj.CRS | None:
     return first.crs
 
 
+def agreed_map_crs(clouds: Sequence[Cloud], given: pyproj.CRS | None) -> pyproj.CRS:
+    """The projected CRS of all of some clouds in metres; heights may differ, and stay what they are.
+
+    A CRS that is given goes before what the files state.
+
+    Raises
+    ------
+    CaptureError
+        A file states none and none is given, they differ, or it is not projected in metres.
+    """
+    crs = given
+    for cloud in clouds:
+        if given is not None:
+            break
+        if cloud.horizontal is None:
+            raise CaptureError(f"{cloud.path}: states no CRS; give it with --crs")
+        if crs is not None and not crs.equals(cloud.horizontal, ignore_axis_order=True):
+            raise CaptureError(
+                f"{cloud.path}: is in {cloud.horizontal.name}, expected {crs.name} as {clouds[0].path.name}"
+            )
+        crs = cloud.horizontal if crs is None else crs
+    assert crs is not None
+    if not crs.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
+        raise CaptureError(f"{clouds[0].path}: is in {crs.name}, expected a projected CRS in metres")
+    return crs
+
+
 def agreed_times(clouds: Sequence[Cloud]) -> None:
     """Refuse clouds whose times count from different beginnings.
 

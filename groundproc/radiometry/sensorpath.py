@@ -16,8 +16,8 @@ from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.gpstime import Clock
 from groundproc.cloud.reader import Chunk, Cloud
+from groundproc.cloud.sameness import agreed_map_crs
 from groundproc.geodesy import check_area
-from groundproc.strips.clouds import agreed_crs
 from groundproc.strips.route import Route, read_route
 
 Array = npt.NDArray[np.float64]
@@ -103,7 +103,7 @@ def flown(
     SwathError
         A file is not as it should be, or the trajectory is of another place or time than the clouds.
     """
-    map_crs = agreed_crs(clouds, crs)
+    map_crs = agreed_map_crs(clouds, crs)
     standard = next((c for c in clouds if c.timed and not c.week_time), None)
     near = None
     if standard is not None:

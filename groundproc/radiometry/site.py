@@ -13,13 +13,13 @@ import shapely
 from flightlog.errors import CaptureError, CoverageError, UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.reader import Chunk, Cloud
+from groundproc.cloud.sameness import agreed_map_crs
 from groundproc.radiometry import sensorpath, signal
 from groundproc.radiometry.atmosphere import transmission
 from groundproc.radiometry.patches import Patches
 from groundproc.radiometry.sensorpath import SensorPath
 from groundproc.radiometry.signal import Signal
 from groundproc.radiometry.targets import Target, read_targets
-from groundproc.strips.clouds import agreed_crs
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, int], object]
@@ -143,7 +143,7 @@ def look(task: Task, progress: Progress) -> Site:
     clouds = [reader.look(path) for path in task.clouds]
     crs = task.crs
     if crs is None and (task.trajectory is not None or task.targets is not None):
-        crs = agreed_crs(clouds, None)
+        crs = agreed_map_crs(clouds, None)
     for cloud in clouds:
         if not cloud.timed:
             raise CaptureError(f"{cloud.path}: its points have no gps_time, by which the place of the sensor is known")

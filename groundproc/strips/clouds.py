@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyproj
 
 from flightlog.errors import CaptureError
 from groundproc.cloud import reader
@@ -59,31 +58,6 @@ def look(path: Path) -> Cloud:
             f"{path}: its points have no gps_time, expected point format 1 or 3 to 10: the trajectory is tied to points by time"
         )
     return cloud
-
-
-def agreed_crs(clouds: Sequence[Cloud], given: pyproj.CRS | None) -> pyproj.CRS:
-    """The projected CRS of all files.
-
-    Raises
-    ------
-    CaptureError
-        A file states none and none is given, they differ, or it is not projected in metres.
-    """
-    crs = given
-    for cloud in clouds:
-        if given is not None:
-            break
-        if cloud.horizontal is None:
-            raise CaptureError(f"{cloud.path}: states no CRS; give it with --crs")
-        if crs is not None and not crs.equals(cloud.horizontal, ignore_axis_order=True):
-            raise CaptureError(
-                f"{cloud.path}: is in {cloud.horizontal.name}, expected {crs.name} as {clouds[0].path.name}"
-            )
-        crs = cloud.horizontal if crs is None else crs
-    assert crs is not None
-    if not crs.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
-        raise CaptureError(f"{clouds[0].path}: is in {crs.name}, expected a projected CRS in metres")
-    return crs
 
 
 def chunks(clouds: Sequence[Cloud], clock: Clock) -> Iterator[Chunk]:

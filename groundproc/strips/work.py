@@ -13,11 +13,12 @@ import pyproj
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError, SwathError, UsageError
 from groundproc.cloud.gpstime import Clock
+from groundproc.cloud.sameness import agreed_map_crs
 from groundproc.files import made_folder
 from groundproc.geodesy import check_area
 from groundproc.strips import report
 from groundproc.strips.adjust import COARSEST_M, MOST_INTERVALS, Adjusted, Sigmas, adjust
-from groundproc.strips.clouds import agreed_crs, chunks, look, rewriters
+from groundproc.strips.clouds import chunks, look, rewriters
 from groundproc.strips.clusters import CLUSTER, Gatherer
 from groundproc.strips.control import as_clusters, read_control
 from groundproc.strips.correction import Correction
@@ -132,7 +133,7 @@ def _site(task: Task) -> Site:
         if any(path.resolve() == (task.folder / name).resolve() for path in task.clouds):
             raise UsageError(f"{task.folder / name}: is an input; say another folder with -o")
     clouds = [look(path) for path in task.clouds]
-    crs = agreed_crs(clouds, task.crs)
+    crs = agreed_map_crs(clouds, task.crs)
     clock = Clock(task.week)
     near = None
     if (standard := next((c for c in clouds if not c.week_time), None)) is not None:
