@@ -147,6 +147,8 @@ def test_mode_and_product_say_whose_a_packet_may_be(
     wrong = packet.copy()
     wrong["blocks"]["flag"][0, 7] = 0xDDFF
     assert not HDL32E.valid(wrong).any()
+    both = np.concatenate([packet, wrong])
+    assert HDL32E.valid(both).tolist() == [hdl32e_s, False], "one bad block spoils its own packet only"
 
 
 # What they tell ----------------------------------------------------------------------------------------------------------
@@ -165,6 +167,7 @@ def test_packets_tell_of_themselves_before_they_are_decoded(
     assert digest.mode.tolist() == [0x37, 0x39]
     assert digest.record_ns.tolist() == [packet_ns, packet_ns // 2]
     assert digest.returns == 2 * 12 * 32 - 5
+    assert {array.dtype.kind for array in (digest.azimuth_cdeg, digest.record_ns, model.stamp_ns(logged))} == {"i"}
     assert model.stamp_ns(logged).tolist() == [7_000, 3_599_999_999_000]
     assert model.same_kind(logged[:1], logged[:1])
     assert not model.same_kind(logged, logged), "the last of the ones is dual, the first of the others single"
@@ -177,6 +180,24 @@ def test_blanks_are_packets_of_each_mode_without_a_return(model: Velodyne) -> No
     shots = [list(model.decode(blank, np.zeros(len(blank), np.int64))) for blank in model.blanks()]
     assert [len(part) for parts in shots for part in parts] == [0, 0]
     assert [part.gated.no_return for parts in shots for part in parts] == [2 * 384, 2 * 192]
+
+
+@pytest.mark.parametrize("model", [HDL32E, VLP16])
+def test_all_shots_are_told_where_those_without_an_echo_are_wanted(
+    data_payload: Callable[..., bytes], model: Velodyne
+) -> None:
+    logged = np.zeros(1, records.SCAN_PACKET_DTYPE)
+    logged["data"] = packets_of([data_payload(7, range(0, 120, 10))])
+    ranges = logged["data"]["blocks"]["returns"]["range"]
+    ranges[:] = 700
+    ranges[0, 3, :5], ranges[0, 3, 5] = 0, 1
+    before = logged.copy()
+    told = model.with_all_shots(logged)
+    assert (logged["data"] == before["data"]).all(), "what was recorded stays as it is"
+    (shots,) = model.decode(told, np.zeros(1, np.int64))
+    assert len(shots) == 12 * 32
+    assert np.count_nonzero(np.isclose(shots.range_m, model.nothing_m)) == 6
+    assert np.count_nonzero(np.isclose(shots.range_m, 1.4)) == 12 * 32 - 6
 
 
 def test_position_packets_give_rates_and_forces_in_si(position_payload: Callable[..., bytes]) -> None:
