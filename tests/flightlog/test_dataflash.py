@@ -221,6 +221,7 @@ def test_what_is_not_wanted_is_counted_and_not_kept() -> None:
     assert set(log.tables) == {"GPS"}
     assert log.counts == {"ATT": 2, "GPS": 1, "MSG": 1}
     assert log.has("GPS", "GWk", "Lat")
+    assert log.has("GPS", *log.tables["GPS"].dtype.names or ())
     assert not log.has("GPS", "T")
     assert not log.has("ATT")
 
@@ -236,7 +237,7 @@ def test_units_and_multipliers_are_the_logs_own() -> None:
         message(12, "QBNN", 0, 13, b"sdkmG-", b"FB0BC-"),
         message(13, "QcfHhI", 5_000_000, 9000, 90.0, 1234, -450, 7),
     ]  # fmt: skip
-    log = dataflash.parse(FMT + unit + multiplier + of_fields + field + b"".join(rows), "a.bin")
+    log = dataflash.parse(FMT + unit + multiplier + of_fields + field + b"".join(rows), "a.bin", wanted=["XYZ"])
     found = {name: float(log.si("XYZ", name)[0]) for name in ("TimeUS", "Turn", "Rate", "Height", "Field", "Raw")}
     assert found == pytest.approx(
         {"TimeUS": 5.0, "Turn": np.pi / 2, "Rate": np.pi / 2, "Height": 12.34, "Field": -0.45, "Raw": 7.0}, rel=1e-12
