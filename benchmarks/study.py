@@ -34,6 +34,14 @@ AIR: Final = "flight: {buzz_deg_s: [0.5, 1.8, 1.8], gust_deg: 0.05}\ngyros: {rot
 MULTIPATH: Final = "faults: {gnss_glitch_at_s: 6, gnss_glitch_s: 8, gnss_glitch_rise_s: 3, gnss_glitch_m: [20, 0, -8]}"
 """Positions that walk away and come back."""
 
+HEIGHT: Final = "faults: {gnss_glitch_at_s: 9, gnss_glitch_s: 1000, gnss_glitch_m: [0, 0, 5]}"
+OFFSET: Final = "faults: {gnss_glitch_at_s: 15, gnss_glitch_s: 30, gnss_glitch_rise_s: 6, gnss_glitch_m: [12, -9, 6]}"
+FLOAT: Final = (
+    "ins: {gnss_sigma_m: 0.01, height_bias_m: 0.01, position_noise_m: 0.01, baro_walk_m: 0.01}\n"
+    "faults: {gnss_glitch_at_s: 9, gnss_glitch_s: 6, gnss_glitch_m: [0.4, -0.3, 0.5]}"
+)
+"""A receiver of centimetres whose ambiguities are wrong for some seconds, and that states the metres of its dilution of precision."""
+
 
 @dataclass(frozen=True, slots=True)
 class Trial:
@@ -106,6 +114,11 @@ TRIALS: Final = (
     Trial("air, 1200 rpm", "survey_fast_gyro", 83, changes=AIR + "\nlidar: {rpm: 1200}"),
     Trial("540 rpm, packets lost", "survey_slow_gyro", 81, changes="lidar: {rpm: 540}\nfaults: {lidar_loss: 0.02}"),
     Trial("multipath", "survey_fast_gyro", 11, 24.0, changes=MULTIPATH),
+    Trial("multipath, velocities too", "survey_fast_gyro", 11, 24.0, changes=MULTIPATH[:-1] + ", gnss_glitch_velocity: true}"),
+    Trial("height jumps by 5 m", "survey_fast_gyro", 11, 24.0, changes=HEIGHT),
+    Trial("fix after take-off", "survey_fast_gyro", 11, 24.0, changes="faults: {gnss_from_s: 8}"),
+    Trial("RTK, floats for a while", "survey_fast_gyro", 11, 24.0, changes=FLOAT),
+    Trial("offset for half a minute", "survey_fast_gyro", 11, 60.0, changes=OFFSET),
     Trial("autopilot 20 ms late", "survey_slow_gyro", 51, changes="ins: {gyro_delay_s: 0.02, position_delay_s: 0.2}"),
 )  # fmt: skip
 

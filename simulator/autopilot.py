@@ -84,7 +84,7 @@ class Autopilot:
         self._options: LinkOptions = options.link
         self._reboot, self._outage = Reboot.of(options.faults), Outage.of(options.faults)
         self._last_fix = self._fix_before_outage()
-        self._garbage_hz = options.faults.garbage_per_s
+        self._garbage_hz, self._fix_from_s = options.faults.garbage_per_s, options.faults.gnss_from_s
         self._mavlink = ardupilotmega.MAVLink(None, srcSystem=SYSTEM, srcComponent=1)
         self._last_received_s = -np.inf
         self._was_after_reboot = False
@@ -210,7 +210,7 @@ class Autopilot:
         return ardupilotmega.MAVLink_raw_imu_message(usec, *values.tolist(), *field.tolist())
 
     def _scaled_pressure(self, m: _Moment) -> Any:
-        height_m = self._origin.height_msl_m + m.belief.position_m[m.row, 2]
+        height_m = self._origin.height_msl_m + m.belief.baro_height_m[m.row]
         hpa = 1013.25 * (1 - 2.25577e-5 * height_m) ** 5.25588
         return ardupilotmega.MAVLink_scaled_pressure_message(m.boot_ms, hpa, 0.0, 3150)
 
@@ -224,6 +224,8 @@ class Autopilot:
         heading = round(np.degrees(m.belief.heading_rad[m.row]) * 100.0) % 36000
         relative_mm = round(m.belief.position_m[m.row, 2] * 1e3)
         stamp_ms = m.boot_ms
+        if m.time_s < self._fix_from_s:
+            return ardupilotmega.MAVLink_global_position_int_message(stamp_ms, 0, 0, 0, relative_mm, 0, 0, 0, heading)
         if self._options.position_stamp == "fix" and not self._outage.holds(m.time_s):
             stamp_ms = m.fix_boot_ns // NS_PER_MS % _U32
         return ardupilotmega.MAVLink_global_position_int_message(
@@ -232,6 +234,8 @@ class Autopilot:
 
     def _gps_raw_int(self, m: _Moment) -> Any:
         fix, dilution, satellites = 3, 120, 11
+        if m.time_s < self._fix_from_s:
+            return ardupilotmega.MAVLink_gps_raw_int_message(0, 1, 0, 0, 0, 9999, 65535, 0, 0, 3)
         if self._last_fix is not None and self._outage.holds(m.time_s):
             m, fix, dilution, satellites = self._last_fix, 1, 9999, 3
         latitude, longitude, height_mm = self._place(m)

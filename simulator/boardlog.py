@@ -129,6 +129,7 @@ class BoardLog:
         self._ins, self._clocks, self._origin, self._seed = ins, clocks, origin, seed
         self._options: BoardOptions = options.board
         self._outage, self._reboot = Outage.of(options.faults), Reboot.of(options.faults)
+        self._fix_from_s = options.faults.gnss_from_s
         for part in self._beginning():
             stream.write(part)
 
@@ -244,7 +245,7 @@ class BoardLog:
         week, of_week = np.divmod([utc_to_gps_ns(t) // NS_PER_MS for t in epoch_ns.tolist()], _WEEK_MS)
         latitude, longitude, height = geodetic(b.position_m, self._origin)
         east, north, up = b.velocity_m_s.T
-        lost = np.array([self._outage.holds(float(t)) for t in time_s])
+        lost = np.array([self._outage.holds(float(t)) or t < self._fix_from_s for t in time_s])
         return GPS.rows(
             len(stamp_us), TimeUS=stamp_us, Status=np.where(lost, 1, 3), GMS=of_week, GWk=week, NSats=np.where(lost, 3, 11),
             HDop=np.where(lost, 99.99, 1.2), Lat=latitude, Lng=longitude, Alt=height, Spd=np.hypot(east, north),
@@ -261,12 +262,12 @@ class BoardLog:
 
     def _baro(self, time_s: Array, stamp_us: npt.NDArray[np.int64], b: Belief) -> npt.NDArray[np.void]:
         del time_s
-        height_m = self._origin.height_msl_m + b.position_m[:, 2]
+        height_m = self._origin.height_msl_m + b.baro_height_m
         pascal = 101_325.0 * (1 - 2.25577e-5 * height_m) ** 5.25588
         return BARO.rows(
             len(stamp_us),
             TimeUS=stamp_us,
-            Alt=b.position_m[:, 2],
+            Alt=b.baro_height_m,
             Press=pascal,
             Temp=31.5,
             SMS=stamp_us // 1000,

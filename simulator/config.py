@@ -302,7 +302,7 @@ class FaultOptions:
     gnss_gap_s: float = option(30.0, "for [s]", minimum=0, maximum=1e4)
     gnss_glitch_at_s: float = option(
         0.0,
-        "positions are off by gnss_glitch_m from [s]: a glitch, multipath or another height; velocities are not",
+        "positions are off by gnss_glitch_m from [s]: a glitch, multipath or another height",
         minimum=0,
         maximum=1e6,
     )
@@ -312,6 +312,12 @@ class FaultOptions:
     )
     gnss_glitch_m: tuple[float, float, float] = option(
         (30.0, 0.0, 0.0), "east, north, up [m]", minimum=-1e5, maximum=1e5
+    )
+    gnss_glitch_velocity: bool = option(
+        False, "velocities go along, as those of a filter do that follows its receiver; else they stay right"
+    )
+    gnss_from_s: float = option(
+        0.0, "the first fix comes at [s]: before, GPS_RAW_INT and GLOBAL_POSITION_INT are zero", minimum=0, maximum=1e6
     )
     garbage_per_s: float = option(0.0, "bursts of line noise on the MAVLink bytes [1/s]", minimum=0, maximum=100)
 

@@ -63,18 +63,22 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class Glitch:
-    """A stretch of true time in which positions are off; never if start is 0."""
+    """A stretch of true time in which positions are off, and perhaps velocities with them; never if start is 0."""
 
     start_s: float
     end_s: float
     rise_s: float
     off_m: tuple[float, float, float]
+    moves: bool = False
 
     @classmethod
     def of(cls, options: FaultOptions) -> "Glitch":
         """The glitch of a configuration."""
         start_s = options.gnss_glitch_at_s
-        return cls(start_s, start_s + options.gnss_glitch_s, options.gnss_glitch_rise_s, options.gnss_glitch_m)
+        return cls(
+            start_s, start_s + options.gnss_glitch_s, options.gnss_glitch_rise_s, options.gnss_glitch_m,
+            options.gnss_glitch_velocity,
+        )  # fmt: skip
 
     def at(self, time_s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """How far positions are off at true times, shape (n,): east, north, up, shape (n, 3) [m]."""
@@ -83,6 +87,13 @@ class Glitch:
         rise_s = max(self.rise_s, 1e-9)
         share = np.minimum((time_s - self.start_s) / rise_s, (self.end_s - time_s) / rise_s)
         return np.asarray(np.clip(share, 0.0, 1.0)[:, None] * np.array(self.off_m))
+
+    def speed_at(self, time_s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """How far velocities are off, shape (n, 3) [m/s]; those of a filter never by a jump of its positions."""
+        if not self.moves or self.rise_s <= 0:
+            return np.zeros((len(time_s), 3))
+        step_s = 0.05
+        return np.asarray((self.at(time_s + step_s) - self.at(time_s - step_s)) / (2.0 * step_s))
 
 
 def arriving(sent_s: npt.NDArray[np.float64], options: FaultOptions, rng: np.random.Generator) -> npt.NDArray[np.bool_]:

@@ -47,6 +47,8 @@ class Belief:
     rates_frd_rad_s, force_frd_m_s2 : shape (n, 3), forward right down
     position_m, velocity_m_s : shape (n, 3), local frame
         Of the GPS antenna where the position is not referred to the IMU.
+    baro_height_m : shape (n,)
+        That of the barometer, which no satellite leads astray.
     """
 
     heading_rad: Array
@@ -57,6 +59,7 @@ class Belief:
     force_frd_m_s2: Array
     position_m: Array
     velocity_m_s: Array
+    baro_height_m: Array
 
 
 class Ins:
@@ -184,6 +187,7 @@ class Ins:
         force = force + o.accel_noise_m_s2 * rng.standard_normal(force.shape)
         place_s = time_s if not o.position_delay_s else np.clip(time_s - o.position_delay_s, 0.0, None)
         position, velocity = self._place(place_s)
+        position = position + o.position_noise_m * rng.standard_normal(position.shape)
         return Belief(
             heading_rad=heading,
             pitch_rad=pitch,
@@ -191,8 +195,9 @@ class Ins:
             field_frd_mgauss=ins_from_frd(self._field(time_s)),
             rates_frd_rad_s=ins_from_frd(rates),  # its own inverse
             force_frd_m_s2=ins_from_frd(force),
-            position_m=position + o.position_noise_m * rng.standard_normal(position.shape),
+            position_m=position,
             velocity_m_s=velocity,
+            baro_height_m=position[:, 2] - self._glitch.at(place_s)[:, 2],
         )
 
     def _field(self, time_s: Array) -> Array:
@@ -212,4 +217,4 @@ class Ins:
             swing = np.cross(self._flight.rates_rad_s(time_s, self._gain), self._antenna_m)
             velocity = velocity + np.einsum("nij,nj->ni", mat, swing)
         off = self._position_error(time_s) + self._glitch.at(time_s)
-        return position + off, velocity + self._velocity_error(time_s)
+        return position + off, velocity + self._velocity_error(time_s) + self._glitch.speed_at(time_s)

@@ -17,6 +17,7 @@ from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.estimation import glitches
 from groundproc.estimation.alignment import align
+from groundproc.estimation.felt import Felt, autopilot_force, felt
 from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.trajectory import HOLD, Trajectory
@@ -103,7 +104,7 @@ def position_fixes(boot: Boot, height: str, undulation_m: float | None = None) -
         fixes = _gps_positions(boot, height)
     else:
         raise LogError("MAVLink: neither GLOBAL_POSITION_INT nor GPS_RAW_INT in the log; a position is needed")
-    fixes = _without_glitches(fixes)
+    fixes = _without_glitches(fixes, _felt(boot, fixes.time_ns))
     if height != "ellipsoid":
         return fixes
     if undulation_m is None:
@@ -111,19 +112,28 @@ def position_fixes(boot: Boot, height: str, undulation_m: float | None = None) -
     return replace(fixes, height_m=fixes.height_m + undulation_m)
 
 
-def _without_glitches(fixes: PositionFixes) -> PositionFixes:
+def _felt(boot: Boot, time_ns: Times) -> Felt | None:
+    """What the autopilot's accelerometers felt between positions; None where it states no attitude of its own, or no forces."""
+    force = autopilot_force(boot)
+    if force is None or not len(time_ns) or attitude_source(boot) not in ("ATTITUDE", "ATTITUDE_QUATERNION"):
+        return None
+    _, attitude_ns, quat, _ = attitudes(boot)
+    return felt(time_ns, force[1:], (attitude_ns, quat))
+
+
+def _without_glitches(fixes: PositionFixes, forces: Felt | None) -> PositionFixes:
     """The positions that hold, and what is to be said of the others."""
     place = [float(np.median(v)) for v in (fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)]
     enu = LocalFrame(*place).from_geodetic(fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)
     time_s: Array = np.asarray((fixes.time_ns - fixes.time_ns[0]) * 1e-9, np.float64)
-    found = glitches.judge(time_s, np.asarray(enu, np.float64), fixes.velocity_m_s)
+    found = glitches.judge(time_s, np.asarray(enu, np.float64), fixes.velocity_m_s, fixes.sigma_m, forces)
     kept, left_out = found.kept, int((~found.kept).sum())
     notes = []
     if left_out:
         at_s = float(time_s[~kept][0])
         notes.append(
-            f"{left_out} positions of {fixes.source} left out: from {at_s:.1f} s after the first one they jump away by up to "
-            f"{found.farthest_m:.0f} m"
+            f"{left_out} positions of {fixes.source} left out: from {at_s:.1f} s after the first one they jump or walk away by up "
+            f"to {found.farthest_m:.0f} m"
         )
     notes += [
         f"positions of {fixes.source} shift by {size_m:.0f} m at {at_s:.1f} s and stay there; nothing contradicts them"

@@ -276,6 +276,21 @@ def test_a_glitch_moves_positions_and_not_velocities():
     assert off[np.argmin(np.abs(TIME_S - 11.0))] == pytest.approx([15.0, 0.0, -4.5], abs=0.1)
 
 
+def test_velocities_of_a_filter_go_along_with_its_glitch_and_the_barometer_does_not():
+    glitch = FaultOptions(
+        gnss_glitch_at_s=10.0, gnss_glitch_s=6.0, gnss_glitch_rise_s=2.0, gnss_glitch_m=(30.0, 0.0, -9.0),
+        gnss_glitch_velocity=True,
+    )  # fmt: skip
+    flight = flown()
+    _, wrong = believed(TIME_S, faults=glitch, flight=flight)
+    _, right = believed(TIME_S, flight=flight)
+    off = wrong.velocity_m_s - right.velocity_m_s
+    rising = (TIME_S > 10.1) & (TIME_S < 11.9)
+    assert off[rising] == pytest.approx(np.tile([15.0, 0.0, -4.5], (rising.sum(), 1)))
+    assert off[(TIME_S > 12.1) & (TIME_S < 13.9)] == pytest.approx(0.0, abs=1e-9)
+    assert wrong.baro_height_m == pytest.approx(right.baro_height_m, abs=1e-9)
+
+
 def test_so_many_packets_get_lost():
     sent_s = np.arange(20_000) / 1808.0
     kept = arriving(sent_s, FaultOptions(lidar_loss=0.02), generator(1, "test"))

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.estimation.observations.fixes import POSITION_TAU_S
+from groundproc.estimation.consensus import POSITION_TAU_S
 from groundproc.estimation.odometry.grid import SLICE_NS
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.track import Track

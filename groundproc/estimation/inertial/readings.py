@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from flightlog.constants import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
+from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
 from groundproc.estimation import ins
+from groundproc.estimation.felt import IMU_MESSAGES, autopilot_force
 from groundproc.estimation.inertial.imu import Samples, Signal, combine
 from groundproc.estimation.ins import PositionFixes
 from groundproc.estimation.observations.measured import Stated
@@ -168,23 +169,15 @@ def _autopilot_imu(boot: Boot, seconds: Callable[[Times], Array]) -> tuple[Sampl
     # an IMU's own message unless another brings the same gyros much oftener
     best = max(
         gyros.values(),
-        key=lambda track: len(track.time_ns) * (1.5 if track.name in _IMU_MESSAGES else 1.0),
+        key=lambda track: len(track.time_ns) * (1.5 if track.name in IMU_MESSAGES else 1.0),
         default=None,
     )
     gyro = None if best is None else Samples(best.name, seconds(best.time_ns), best.rate_rad_s)
-    forces = [name for name in _IMU_MESSAGES if boot.has(name, 30)]
-    if not forces:
+    found = autopilot_force(boot)
+    if found is None:
         return gyro, None
-    name = max(forces, key=lambda name: len(boot.tables[name]))
-    table = boot.tables[name]
-    unit = 1.0 if name == "HIGHRES_IMU" else 1e-3 * STANDARD_GRAVITY_M_S2
-    frd = np.stack([table[f].astype(np.float64) for f in ("xacc", "yacc", "zacc")], axis=1) * unit
-    if np.ptp(frd, axis=0).max() == 0.0:
-        return gyro, None
-    return gyro, Samples(name, seconds(boot.stamps_ns[name]), frames.ins_from_frd(frd))
-
-
-_IMU_MESSAGES: Final = ("RAW_IMU", "SCALED_IMU", "HIGHRES_IMU")
+    name, time_ns, force_m_s2 = found
+    return gyro, Samples(name, seconds(time_ns), force_m_s2)
 
 
 def _with_fix(boot: Boot, fixes: PositionFixes) -> Mask:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.constants import NS_PER_S
+from groundproc.estimation.consensus import POSITION_TAU_S, POSITION_WHITE_M
 from groundproc.estimation.method import Given
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, Stated, turned_by
 from groundproc.estimation.observations.moments import means, poses, seconds, spots, velocities, within
@@ -33,10 +34,6 @@ from groundproc.numerics.robust import huber, sigma_of_columns
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-POSITION_TAU_S: Final = np.array([60.0, 60.0, 300.0])
-POSITION_WHITE_M: Final = 0.1
-"""Errors of a GNSS receiver that smooths last for a minute, those of a height that the barometer carries for longer (east, north, up);
-a tenth of a metre is new each second."""
 LEAST_POSITION_SIGMA_M: Final = 0.02
 DELAY_SIGMA_S: Final = 0.0
 """How well the delay of the fixes beyond that of the autopilot's clock is known; 0: it is none, and is held. Metres of lasting errors do

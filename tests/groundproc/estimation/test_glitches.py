@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from groundproc.estimation.felt import Felt
 from groundproc.estimation.glitches import judge
 
 Array = npt.NDArray[np.float64]
@@ -78,3 +79,65 @@ def test_too_few_positions_are_taken_as_they_are(count: int) -> None:
     time_s, enu, velocity = flight()
     nothing: Any = judge(time_s[:count], enu[:count], velocity[:count])
     assert nothing.kept.all()
+
+
+def wandering(
+    seconds: float, seed: int, sigma_m: float = 2.0, rate_hz: float = 5.0
+) -> tuple[Array, Array, Array, Array]:
+    """The circle with errors that last a minute, and velocities 0.2 m/s off for a second."""
+    time_s, true, velocity = flight(seconds, rate_hz, 0.0)
+    rng = np.random.default_rng(seed)
+    keep, brief = np.exp(-1.0 / rate_hz / 60.0), np.exp(-1.0 / rate_hz)
+    error, speed = sigma_m * rng.standard_normal(3), np.zeros(3)
+    errors, speeds = [], []
+    for _ in time_s:
+        error = keep * error + sigma_m * np.sqrt(1.0 - keep**2) * rng.standard_normal(3)
+        speed = brief * speed + 0.2 * np.sqrt(1.0 - brief**2) * rng.standard_normal(3)
+        errors.append(error)
+        speeds.append(speed)
+    return time_s, true + np.array(errors), velocity + np.array(speeds), np.full_like(true, sigma_m)
+
+
+@pytest.mark.parametrize(("seconds", "rise_s"), [(24.0, 3.0), (60.0, 3.0), (60.0, 5.0)])
+def test_what_walks_away_slowly_and_comes_back_is_left_out(seconds: float, rise_s: float) -> None:
+    time_s, enu, velocity, sigma = wandering(seconds, 3)
+    start_s, end_s = 4.0, 4.0 + 2.0 * rise_s + 1.0
+    share = np.clip(np.minimum((time_s - start_s) / rise_s, (end_s - time_s) / rise_s), 0.0, 1.0)
+    enu = enu + share[:, None] * np.array([20.0, 0.0, -8.0])
+    found = judge(time_s, enu, velocity, sigma)
+    assert not found.kept[share > 0.5].any()
+    assert found.kept[(time_s < start_s) | (time_s > end_s + 1.0)].mean() > 0.97
+    assert found.farthest_m == pytest.approx(np.hypot(20.0, 8.0), abs=6.0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_errors_that_last_a_minute_lose_nothing(seed: int) -> None:
+    time_s, enu, velocity, sigma = wandering(180.0, seed)
+    for stated in (sigma, 0.5 * sigma, 3.0 * sigma):
+        assert judge(time_s, enu, velocity, stated).kept.mean() > 0.995
+
+
+def test_a_walk_without_a_velocity_of_its_own_is_no_walk() -> None:
+    time_s, enu, _, sigma = wandering(60.0, 5)
+    assert judge(time_s, enu, np.zeros_like(enu), sigma).kept.all()
+
+
+def test_a_velocity_that_goes_along_is_told_by_what_the_accelerometers_felt() -> None:
+    time_s, enu, velocity, sigma = wandering(60.0, 3)
+    start_s, end_s = 20.0, 28.0
+    share = np.clip(np.minimum((time_s - start_s) / 3.0, (end_s - time_s) / 3.0), 0.0, 1.0)
+    walk = share[:, None] * np.array([20.0, 0.0, -8.0])
+    # forces with a heading 5 deg off, and a tilt that is half a degree off for the whole minute
+    turn = np.deg2rad(5.0)
+    true = flight(60.0, 5.0, 0.0)[2]
+    sensed = true @ np.array([[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    sensed = sensed - sensed[0] + 0.086 * time_s[:, None] * np.array([1.0, -1.0, 0.0])
+    forces = Felt(sensed, np.zeros(len(time_s)))
+    along = velocity + np.gradient(walk, time_s, axis=0)
+    assert judge(time_s, enu + walk, along, sigma).kept[share == 1.0].all()  # nothing else contradicts it
+    found = judge(time_s, enu + walk, along, sigma, forces)
+    assert not found.kept[share > 0.2].any()
+    assert found.kept[(time_s < start_s - 1.0) | (time_s > end_s + 1.0)].all()
+    assert judge(time_s, enu, velocity, sigma, forces).kept.all()
+    silent = Felt(sensed, 1e6 * (time_s > 22.0) + 1e6 * (time_s > 26.0))
+    assert judge(time_s, enu, velocity, sigma, silent).kept.all()
