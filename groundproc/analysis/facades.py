@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_closing, label
+from scipy.ndimage import binary_closing, binary_dilation, label
 
 from groundproc.numerics.normals import normals
 
@@ -64,6 +64,11 @@ class Facade:
         return float(self.within.sum()) * CELL_M**2
 
     @property
+    def height_m(self) -> float:
+        """From its lowest cell to its highest."""
+        return float(self.wall.shape[0] * CELL_M)
+
+    @property
     def ends(self) -> Array:
         """Both ends in plan, shape (2, 2)."""
         reach = self.start_m + np.array([0.0, self.wall.shape[1] * CELL_M])
@@ -75,11 +80,19 @@ class Facade:
 
     def holds(self, xyz_m: Array) -> Flags:
         """Whether places lie within the wall or its openings, as seen along the normal, shape (n,)."""
+        return self._in(self.within, xyz_m)
+
+    def near(self, xyz_m: Array) -> Flags:
+        """The same, and up to two cells beside it."""
+        return self._in(np.asarray(binary_dilation(np.pad(self.within, 2), np.ones((3, 3), np.bool_), 2)), xyz_m, 2)
+
+    def _in(self, cells: Flags, xyz_m: Array, margin: int = 0) -> Flags:
         column = np.floor((xyz_m[:, :2] @ self.along - self.start_m) / CELL_M).astype(np.int64)
         row = np.floor((xyz_m[:, 2] - self.low_m) / CELL_M).astype(np.int64)
-        rows, columns = self.within.shape
+        row, column = row + margin, column + margin
+        rows, columns = cells.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        return np.asarray(inside & self.within[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)])
+        return np.asarray(inside & cells[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)])
 
     def through(self, origin_m: Array, xyz_m: Array) -> Array:
         """How far behind the wall points lie whose beams went through it [m], shape (n,); NaN for others."""

@@ -32,9 +32,10 @@ from groundproc.cloud.classes import (
     LOW,
     LOW_NOISE,
     MEDIUM,
-    MOVING,
+    OF_USES,
     UNCLASSIFIED,
     WATER,
+    merged,
 )
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
@@ -50,7 +51,7 @@ Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
 NAMES: Final = {
-    kind: table.NAMES[kind] for kind in (GROUND, LOW, MEDIUM, HIGH, BUILDING, LOW_NOISE, WATER, HIGH_NOISE, MOVING)
+    kind: table.NAMES[kind] for kind in (GROUND, LOW, MEDIUM, HIGH, BUILDING, LOW_NOISE, WATER, HIGH_NOISE, *OF_USES)
 }
 _LOW_M, _MEDIUM_M = 0.5, 2.0
 """Tops of low and of medium vegetation."""
@@ -224,8 +225,7 @@ def work(task: Task, progress: Progress) -> Made:
         with Rewriter(cloud, aside, compressed, ("classification", "hag")) as out:
             for record, xyz, noise in area.floor.pieces():
                 hag, kind = area.classes(xyz, noise)
-                if noise.any():  # what moves stays what it is; noise may be above the ground or below it
-                    kind[np.asarray(record.classification) == MOVING] = MOVING
+                kind = merged(record.classification, kind)
                 area.made.classes.update(dict(zip(*_counted(kind), strict=True)))
                 out.write(record, columns={"classification": kind, "hag": hag})
     if not area.made.classes[GROUND]:

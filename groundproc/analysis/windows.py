@@ -1,7 +1,7 @@
 """From a cloud to what is seen through windows: points behind the walls of houses whose beams went through an opening.
 
-A point belongs to a window when its beam crossed a wall within that wall's own outline. Where beams are not known, the outside of a wall is
-the side that has ground before it, and what lies behind within the outline counts. Points are never taken away and are no noise: behind
+A point belongs to a window when its beam crossed a wall within that wall's own outline. Where beams are not known, what is indoors counts
+(`indoors`). Points are never taken away and are no noise: behind
 a pane only a few beams in a hundred come back, and lie alone.
 
 The cloud is read for its ground (see `terrain.floor`), for squares of ground with all around them, and to be written anew. Memory: that of
@@ -18,10 +18,11 @@ import numpy.typing as npt
 import shapely
 
 from flightlog.errors import CoverageError
-from groundproc.analysis.facades import CELL_M, Facade, facades
+from groundproc.analysis.facades import Facade, facades
+from groundproc.analysis.indoors import Tops, indoors, outer_walls
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
-from groundproc.cloud.classes import PANE
+from groundproc.cloud.classes import PANE, merged
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Found, Tile, Tiles, side_for
 from groundproc.files import written_aside
@@ -39,7 +40,6 @@ _LEAST_DEPTH_M: Final = 0.1
 _HALO_M: Final = 12.0
 _FEWEST_PLANE: Final = 30
 _ON_PLANE_M: Final = 0.15
-_BEFORE_M: Final = 2.5
 _OLD_FORMATS: Final = 5
 _KEPT: Final = {"above": "f4", "east": "f4", "north": "f4", "up": "f4", "pulse": "f8", "rank": "u1"}
 
@@ -123,7 +123,7 @@ def work(task: Task, progress: Progress) -> Made:
     """
     cloud = reader.look(task.cloud)
     path = _path(task, cloud)
-    beams = "no beams: the outside is where the ground is" if path is None else f"beams, the sensor {path.source}"
+    beams = "no beams: indoors is what walls and roofs enclose" if path is None else f"beams, the sensor {path.source}"
     made = Made(cloud.points, beams)
     floor = Floor(cloud, task.output.parent, progress)
     found = _found(task, floor, path, made)
@@ -136,8 +136,8 @@ def work(task: Task, progress: Progress) -> Made:
         made.warnings.append("no wall of a house was found")
     elif path is None:
         made.warnings.append(
-            "where the beams went is not known: side walls and roofs behind a facade are taken for what is seen through it; give the "
-            "trajectory with -t"
+            "where the beams went is not known: what is indoors is told by walls and roofs alone, with errors near both; "
+            "give the trajectory with -t"
         )
     return made
 
@@ -184,14 +184,16 @@ def _of_tile(tile: Tile, made: Made) -> npt.NDArray[np.uint8]:
     xyz, above = tile.xyz_m, tile.columns["above"]
     kind = np.zeros(len(xyz), np.uint8)
     walls = facades(xyz[above > 0.3])
+    tops = Tops(xyz)
+    outer = outer_walls(walls, tops)
     origin = xyz + np.stack([tile.columns[name] for name in ("east", "north", "up")], axis=1)
-    for facade in walls:
+    for number, facade in enumerate(walls):
         near = np.flatnonzero(np.abs(facade.off(xyz)) < DEPTH_M)
-        start = origin[near]
-        unknown = np.isnan(start[:, 0])
-        if unknown.any():
-            start[unknown] = _straight(facade, xyz, above)(xyz[near[unknown]])
-        depth = facade.through(start, xyz[near])
+        unknown = np.isnan(origin[near, 0])
+        depth = np.full(len(near), np.nan)
+        depth[~unknown] = facade.through(origin[near[~unknown]], xyz[near[~unknown]])
+        if unknown.any() and number in outer:
+            depth[unknown] = indoors(outer[number], list(outer.values()), tops, xyz[near[unknown]])
         behind = np.nan_to_num(depth, nan=0.0) > _LEAST_DEPTH_M
         kind[near[behind]] = 1
         ends = facade.ends.mean(axis=0)
@@ -200,21 +202,6 @@ def _of_tile(tile: Tile, made: Made) -> npt.NDArray[np.uint8]:
             made.walls.append(Wall(facade, int(behind.sum()), *_plane_behind(depth[behind])))
     _panes(tile, walls, kind)
     return kind
-
-
-def _straight(facade: Facade, xyz: Array, above: npt.NDArray[Any]) -> Callable[[Array], Array]:
-    """Where beams came from if they came straight at the wall from the side that has ground before it."""
-    off = facade.off(xyz)
-    low = (above < 0.3) & (np.abs(off) > 0.3) & (np.abs(off) < _BEFORE_M)
-    low[low] = facade.holds(np.column_stack([xyz[low, :2], np.full(int(low.sum()), facade.low_m + 1.0)]))
-    side = 1.0 if (off[low] > 0).sum() >= (off[low] < 0).sum() else -1.0
-
-    def origins(places: Array) -> Array:
-        out = places.copy()
-        out[:, :2] += (side * 5.0 - facade.off(places))[:, None] * facade.normal
-        return out
-
-    return origins
 
 
 def _plane_behind(depth_m: Array) -> tuple[float, int]:
@@ -253,12 +240,10 @@ def _write(task: Task, floor: Floor, found: Found, aside: Path, made: Made) -> N
             at += len(chunk.points)
             made.behind += int((kind == 1).sum())
             made.panes += int((kind == 2).sum())
-            given = np.asarray(record.classification)
             old = record.point_format.id <= _OLD_FORMATS
             narrow += int((kind > 0).sum()) * old
-            out.write(
-                record, columns={"classification": np.where((kind > 0) & (not old), PANE, given).astype(np.uint8)}
-            )
+            kind = merged(record.classification, np.where((kind > 0) & (not old), PANE, 0), (PANE,))
+            out.write(record, columns={"classification": kind})
             floor.progress(len(chunk.points))
     if narrow:
         made.warnings.append(
@@ -274,7 +259,7 @@ def _write_walls(aside: Path, ending: str, floor: Floor, walls: Sequence[Wall]) 
         shapes.append(shapely.LineString(floor.metres.back(ends)))
     columns: dict[str, npt.NDArray[Any]] = {
         "area_m2": np.array([each.facade.area_m2 for each in walls], np.float64),
-        "height_m": np.array([each.facade.wall.shape[0] * CELL_M for each in walls], np.float64),
+        "height_m": np.array([each.facade.height_m for each in walls], np.float64),
         "behind": np.array([each.behind for each in walls], np.int32),
         "depth_m": np.array([each.depth_m for each in walls], np.float64),
         "on_plane": np.array([each.on_plane for each in walls], np.int32),

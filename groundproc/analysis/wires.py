@@ -36,6 +36,7 @@ from groundproc.cloud.classes import (
     STAY,
     TOWER,
     UNCLASSIFIED,
+    merged,
 )  # fmt: skip
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Tiles, side_for
@@ -47,6 +48,7 @@ Progress = Callable[[int], object]
 
 _OLD_FORMATS: Final = 5
 _LAST_OLD_CLASS: Final = 31
+_OWN: Final = (GUARD, CONDUCTOR, TOWER, MAST, POLE, FENCE, STAY)
 _ON_WIRE_M: Final = 0.3
 _ON_POLE_M: Final = 0.5
 _AT_POLE_M: Final = 1.5
@@ -324,12 +326,11 @@ def _write_clearance(path: Path, aside: Path, floor: Floor, made: Made) -> None:
             narrow = record.point_format.id <= _OLD_FORMATS
             if narrow:
                 kind = np.where(kind > _LAST_OLD_CLASS, UNCLASSIFIED, kind)
-            given = np.asarray(record.classification)
             ours = (kind >= GUARD) & (kind != HIGH_NOISE)
             out.write(
                 record,
                 columns={
-                    "classification": np.where(ours, kind, given).astype(np.uint8),
+                    "classification": merged(record.classification, np.where(ours, kind, 0), _OWN),
                     "clearance": distance.astype(np.float32),
                 },
             )

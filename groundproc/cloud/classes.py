@@ -4,7 +4,11 @@ A command writes the numbers that it finds and leaves others as they are. Number
 something else by them.
 """
 
+from collections.abc import Sequence
 from typing import Final
+
+import numpy as np
+import numpy.typing as npt
 
 UNCLASSIFIED: Final = 1
 GROUND: Final = 2
@@ -34,3 +38,22 @@ NAMES: Final = {
 """All of them, in words."""
 NO_SURFACE: Final = (LOW_NOISE, HIGH_NOISE, MOVING)
 """What belongs to no surface that stands: left out of heights, rasters, volumes and comparisons unless they are asked for."""
+OF_USES: Final = (GUARD, CONDUCTOR, TOWER, MAST, POLE, FENCE, STAY, PANE, MOVING)
+"""What a use found by more than height: one that classes the same points later leaves it."""
+
+
+def merged(given: npt.ArrayLike, found: npt.ArrayLike, own: Sequence[int] = ()) -> npt.NDArray[np.uint8]:
+    """Classes to write, shape (n,): those found, but for points that another use has classed already.
+
+    Parameters
+    ----------
+    given : array of integers, shape (n,)
+        As the cloud has them.
+    found : array of integers, shape (n,)
+        0 where nothing was found: the class stays.
+    own : sequence of int
+        Classes of `OF_USES` that this use gives: it may replace its own.
+    """
+    given, found = np.asarray(given), np.asarray(found)
+    others = [each for each in OF_USES if each not in own]
+    return np.where((found == 0) | np.isin(given, others), given, found).astype(np.uint8)

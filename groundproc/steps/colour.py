@@ -39,4 +39,5 @@ STEP: Final = Step(
     work=work,
     files=photographs.files,
     parts=photographs.parts,
+    reads=photographs.reads,
 )

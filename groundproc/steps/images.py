@@ -51,4 +51,5 @@ STEP: Final = Step(
     files=files,
     check=photographs.check,
     parts=photographs.parts,
+    reads=photographs.reads,
 )

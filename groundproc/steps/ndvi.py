@@ -55,4 +55,5 @@ STEP: Final = Step(
     work=work,
     files=files,
     parts=photographs.parts,
+    reads=photographs.reads,
 )

@@ -40,4 +40,5 @@ STEP: Final = Step(
     work=work,
     files=photographs.files,
     parts=photographs.parts,
+    reads=photographs.reads,
 )

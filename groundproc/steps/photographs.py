@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +24,12 @@ _BESIDE: Final = ("rig", "image_times", "panels", "ortho_gsd_m")
 def parts(request: Request) -> Mapping[str, Any]:
     """The step itself, where there are photographs."""
     return {} if request.survey.images is None else {WHOLE: {}}
+
+
+def reads(request: Request) -> Mapping[str, Sequence[str]]:
+    """Of what was placed the cloud only."""
+    names = [each.name for each in chosen(request.survey.products)]
+    return {"place": [name for name in CLOUDS if name in names][:1]}
 
 
 def photographs(request: Request) -> list[Path]:

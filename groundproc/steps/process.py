@@ -187,7 +187,7 @@ def key_of(step: Step, part: str, request: Request, ledger: Ledger) -> Key:
         "logs": sorted(ledger.fingerprint(log).digest for log in request.logs) if step.reads_logs else [],
         "settings": settings | {"": step.parts(request)[part]},
         "files": {name: ledger.fingerprint(path).digest for name, path in files.items()},
-        "after": {other.name: ledger.digest(other.units(request)) for other in steps() if other.name in step.after},
+        "after": {name: ledger.digest(units) for name, units in step.forerunners(request).items()},
     }
 
 
@@ -197,8 +197,7 @@ def reasons(step: Step, part: str, request: Request, ledger: Ledger) -> list[str
     entry = ledger.entries.get(unit)
     if entry is None:
         return ["not made yet"]
-    forerunners = [unit for other in steps() if other.name in step.after for unit in other.units(request)]
-    waits = [unit for unit in forerunners if unit not in ledger.entries]
+    waits = [unit for units in step.forerunners(request).values() for unit in units if unit not in ledger.entries]
     if waits:
         return [f"{unit} is to be made first" for unit in waits]
     key, before = key_of(step, part, request, ledger), entry.key
@@ -230,11 +229,12 @@ def states(request: Request, ledger: Ledger) -> list[State]:
     found: list[State] = []
     to_do: set[str] = set()
     for step in steps():
-        waits = [f"{name} comes first" for name in step.after if name in to_do]
+        before = step.forerunners(request)
+        waits = [f"{name} comes first" for name in step.after if to_do.intersection(before[name])]
         for part in step.parts(request):
             why = waits or reasons(step, part, request, ledger)
             if why:
-                to_do.add(step.name)
+                to_do.add(step.unit(part))
             found.append(_state(step, part, why, ledger))
     return found
 

@@ -1,6 +1,6 @@
 """What a step is: what it reads, the settings it looks at, what it makes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -47,6 +47,8 @@ class Step:
     parts : callable
         What of it can be made alone, such as one of several products: settings of each that concern no other, by name. A step that is one
         thing has one part without a name.
+    reads : callable
+        Of steps in `after`, the parts that it reads, by the step's name; of a step that is not named all of them.
     singly : bool
         Parts are made one after the other and entered in the ledger each when it is there; else in one go, which may share its work.
     """
@@ -60,11 +62,23 @@ class Step:
     files: Callable[[Request], Mapping[str, Path]] = lambda request: {}
     check: Callable[[Request], None] = lambda request: None
     parts: Callable[[Request], Mapping[str, Any]] = lambda request: {WHOLE: {}}
+    reads: Callable[[Request], Mapping[str, Sequence[str]]] = lambda request: {}
     singly: bool = False
 
     def unit(self, part: str) -> str:
         """Name of a part in the ledger."""
         return f"{self.name}{BETWEEN}{part}" if part else self.name
+
+    def forerunners(self, request: Request) -> dict[str, list[str]]:
+        """What it reads of each step before it: names in the ledger."""
+        some, found = self.reads(request), {}
+        for other in steps():
+            if other.name in self.after:
+                wanted = some.get(other.name)
+                found[other.name] = [
+                    other.unit(part) for part in other.parts(request) if wanted is None or part in wanted
+                ]
+        return found
 
     def units(self, request: Request) -> dict[str, Any]:
         """Own settings of each part by its name in the ledger."""

@@ -2,7 +2,7 @@
 
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,6 +49,11 @@ def check(request: Request) -> None:
         raise UsageError(f"targets: {targets}: no such file; expected polygons of known reflectance (.geojson, .gpkg)")
 
 
+def reads(request: Request) -> Mapping[str, Sequence[str]]:
+    """Of what was placed the cloud only."""
+    return {"place": cloud_names(request)[:1]}
+
+
 def cloud_names(request: Request) -> list[str]:
     """Products that hold the points."""
     products = [each.name for each in chosen_products(request.survey.products)]
@@ -84,5 +89,6 @@ STEP: Final = Step(
     files=files,
     check=check,
     parts=parts,
+    reads=reads,
     singly=True,
 )

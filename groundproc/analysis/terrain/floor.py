@@ -16,7 +16,7 @@ from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
 from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, settings_for
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.cloud import reader
-from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, NO_SURFACE, UNCLASSIFIED
+from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, NO_SURFACE, PANE, UNCLASSIFIED
 from groundproc.cloud.metres import metres_of
 from groundproc.raster.cells import Cells
 from groundproc.raster.grid import Grid, Window
@@ -84,12 +84,12 @@ class Floor:
         self._find(lowest, fine)
 
     def pieces(self) -> Iterator[tuple[Any, Array, npt.NDArray[np.bool_]]]:
-        """Records, their places in metres, and which belong to no surface: by their class they were noise already, or moved."""
+        """Records, their places in metres, and which belong to no surface outdoors: by their class noise, what moved, or behind panes."""
         for chunk in reader.chunks(self.cloud, columns=("classification",)):
             kind = chunk.points.columns.get("classification")
             xyz = np.ascontiguousarray(self.metres.of(chunk.points.xyz_m))
             none = np.zeros(len(xyz), np.bool_)
-            yield chunk.record, xyz, none if kind is None else np.isin(kind, NO_SURFACE)
+            yield chunk.record, xyz, none if kind is None else np.isin(kind, (*NO_SURFACE, PANE))
             self.progress(len(xyz))
 
     def _find(self, lowest: Cells, fine: Grid) -> None:

@@ -12,6 +12,7 @@ import rasterio
 import shapely
 
 from groundproc.cli import main
+from groundproc.cloud.classes import OF_USES
 from simulator import outdoors
 
 ORIGIN = np.array([533_000.0, 6_472_000.0])
@@ -198,3 +199,19 @@ def test_a_handful_of_points_is_a_cloud_too(count: int, tmp_path: Path) -> None:
     ]
     assert main(["ground", *words]) == 0
     assert len(laspy.read(tmp_path / "o.laz")) == count
+
+
+def test_what_other_uses_classed_survives(tmp_path: Path) -> None:
+    place = outdoors.village(seed=1, side_m=40.0, per_m2=6.0)
+    cloud = write_cloud(tmp_path / "c.laz", place.xyz)
+    las = laspy.read(cloud)
+    given = np.where(np.arange(len(las.points)) % 10 < len(OF_USES), np.resize([*OF_USES, 1], len(las.points)), 1)
+    las.classification = given.astype(np.uint8)
+    las.write(cloud)
+    assert main(["ground", str(cloud), "-o", str(tmp_path / "o.laz"), "--json", str(tmp_path / "f.json")]) == 0
+    after = np.asarray(laspy.read(tmp_path / "o.laz").classification)
+    ours = np.isin(given, OF_USES)
+    assert np.array_equal(after[ours], given[ours])
+    assert np.isin(after[~ours], (2, 3, 4, 5, 6, 7, 9, 18)).all()
+    figures = json.loads((tmp_path / "f.json").read_text())
+    assert sum(figures["classes"].values()) == figures["points"] == len(after)

@@ -115,3 +115,14 @@ def test_every_use_has_options_that_are_told_of_and_a_page() -> None:
     for each in chosen(list(REGISTRY)):
         assert each.options, each.name
         assert (docs / f"{each.name}.md").is_file()
+
+
+def test_a_product_beside_the_cloud_leaves_the_uses_as_they_are(dual_flight: Any, out: Path) -> None:
+    before = finished(out)
+    assert (
+        run(dual_flight.log, out, "--uses", "ground,trees", "--products", "cloud.laz,dsm.tif,report.html") in COMPLETE
+    )
+    after = finished(out)
+    assert "place: dsm.tif" in after
+    assert {name for name in after if name.startswith("uses")} == {name for name in before if name.startswith("uses")}
+    assert all(after[name] == before[name] for name in before if name.startswith("uses"))
