@@ -13,7 +13,7 @@ CHAPTERS: Final = {
     "trajectory and calibration": ("calibrate", "compass", "ppk", "adjust", "verify-sensor"),
     "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse", "merge", "tile"),
     "what people fly for": (
-        "ground", "trees", "wires", "pipes", "windows", "detect", "change", "viewshed", "passability", "reflectance", "orthophoto",
+        "ground", "trees", "wires", "pipes", "windows", "detect", "soil", "change", "viewshed", "passability", "reflectance", "orthophoto",
     ),
     "images": ("images", "colour", "ortho", "ndvi", "wide", "mesh", "drape"),
     "this computer": ("warmup", "completion"),

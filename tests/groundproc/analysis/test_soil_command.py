@@ -1,0 +1,113 @@
+"""`swath soil` on ground of known height in which patches of half a metre were dug up or filled by 3 cm."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+
+from groundproc.cli import main
+from simulator import epochs
+from tests.groundproc.analysis.test_ground_command import ORIGIN, write_cloud
+
+SIDE_M, DEEP_M, DARKER = 24.0, 0.03, 0.75
+PLACES = np.stack(np.meshgrid(np.arange(3.0, 22.0, 4.5), np.arange(3.0, 22.0, 4.5)), axis=-1).reshape(-1, 2)
+SIGNS = np.where(np.arange(len(PLACES)) % 2, 1.0, -1.0)
+
+
+def smooth(xy: np.ndarray) -> np.ndarray:
+    return np.asarray(0.08 * xy[:, 0] + 0.2 * np.sin(xy[:, 1] / 6.0))
+
+
+def ground(folder: Path, name: str, height: epochs.Heights, dug: bool, seed: int, lit: bool = True) -> Path:
+    rng = np.random.default_rng(seed)
+    xyz = epochs.sampled(rng, height, SIDE_M, 300.0, 0.02)
+    strength = 30.0 * (1.0 + 0.2 * rng.standard_normal(len(xyz))).clip(0.1)
+    if dug:
+        for (x, y), sign in zip(PLACES, SIGNS, strict=True):
+            inside = (np.abs(xyz[:, 0] - x) < 0.25) & (np.abs(xyz[:, 1] - y) < 0.25)
+            xyz[inside, 2] += sign * DEEP_M
+            strength[inside] *= DARKER
+    path = write_cloud(folder / f"{name}.laz", xyz)
+    las = laspy.read(path)
+    las.intensity = (100.0 * strength if lit else 0.0 * strength).astype(np.uint16)
+    las.write(path)
+    return path
+
+
+def found(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    meta, _, shapes, fields = pyogrio.raw.read(path)
+    middles = np.array([(g.centroid.x, g.centroid.y) for g in shapely.from_wkb(shapes)]).reshape(-1, 2) - ORIGIN
+    return middles, dict(zip(meta["fields"], fields, strict=True))
+
+
+def judge(path: Path) -> tuple[float, int, dict[str, Any], np.ndarray]:
+    """Share of the places found, claims that are none, attributes, and which claim is nearest to each place."""
+    middles, table = found(path)
+    apart = np.linalg.norm(middles[:, None] - PLACES[None], axis=2)
+    return float((apart.min(axis=0) < 0.3).mean()), int((apart.min(axis=1) > 0.5).sum()), table, apart.argmin(axis=0)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("soil")
+    ground(folder, "one", smooth, True, 1)
+    words = ["soil", str(folder / "one.laz"), "-o", str(folder / "one.geojson"), "--json", str(folder / "one.json")]
+    assert main(words) == 0
+    return folder
+
+
+def test_patches_of_3_cm_on_even_ground_are_found(made: Path) -> None:
+    rate, false, table, nearest = judge(made / "one.geojson")
+    assert rate >= 0.95
+    assert false <= 1
+    # 3 cm, and the patch of cells that straddle its edge: within a third
+    height = table["height_m"][nearest]
+    assert np.sign(height).tolist() == SIGNS.tolist()
+    assert np.abs(height) == pytest.approx(DEEP_M, abs=0.012)
+    assert np.median(table["reflectance_step"][nearest]) == pytest.approx(DARKER, abs=0.1)
+    assert np.median(table["area_m2"][nearest]) == pytest.approx(0.25, rel=0.5)
+
+
+def test_figures_say_how_many_and_by_what(made: Path) -> None:
+    figures = json.loads((made / "one.json").read_text())
+    assert figures["raised"] + figures["sunk"] == figures["patches"]
+    assert figures["strength"] == "intensity"
+    assert figures["registration_sigma_m"] is None
+    assert figures["warnings"] == []
+
+
+def test_between_two_epochs_stones_that_stayed_do_not_count(tmp_path: Path) -> None:
+    height = epochs.rough(3, (0.1, 0.05), 0.06)
+    a, b = ground(tmp_path, "a", height, False, 4), ground(tmp_path, "b", height, True, 5, lit=False)
+    words = ["soil", str(b), "--before", str(a), "-o", str(tmp_path / "s.geojson"), "--json", str(tmp_path / "f.json")]
+    assert main(words) == 0
+    rate, false, _, _ = judge(tmp_path / "s.geojson")
+    assert rate >= 0.9
+    assert false <= 1
+    figures = json.loads((tmp_path / "f.json").read_text())
+    assert figures["registration_sigma_m"] < 0.01
+    assert figures["strength"] is None
+    assert any("height alone" in each for each in figures["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--size", "0"), "--size 0 m: expected 0.1 to 20 m"),
+        (("--least-score", "nan"), "--least-score nan"),
+        (("--registered",), "expected with --before"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(
+    made: Path, tmp_path: Path, words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["soil", str(made / "one.laz"), "-o", str(tmp_path / "o.geojson"), *words]) in (1, 2)
+    err = capsys.readouterr().err.strip()
+    assert said in err
+    assert "\n" not in err
+    assert not (tmp_path / "o.geojson").exists()
