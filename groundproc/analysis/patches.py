@@ -13,14 +13,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import correlate1d, label, maximum_filter, median_filter, uniform_filter
 
+from groundproc.numerics.robust import MAD_TO_SIGMA
+
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 AROUND: Final = 4.0
 """Side of the square that a plane is fitted to, in sizes of a patch."""
 _ROUNDS: Final = 3
-_LEAST_FILLED: Final = 0.4
-"""Share of a patch, and of its surroundings, that has to be measured."""
+_LEAST_FILLED: Final = 0.6
+_LEAST_AROUND: Final = 0.4
+"""Shares of a patch, and of the square around it, that have to be measured: on the edge of a cloud that is less than half."""
 _BLOCKS: Final = 8
 """Scatter is told in squares of so many patches, three by three of them."""
 _LEAST_HEIGHT: Final = 3.0
@@ -128,7 +131,7 @@ def _over(values: Array, size: int) -> tuple[Array, Array, Flags]:
     weight = known.astype(np.float64)
     around = round(AROUND * size) | 1
     within = uniform_filter(known.astype(np.float64), size) >= _LEAST_FILLED
-    filled = within & (uniform_filter(known.astype(np.float64), around) >= _LEAST_FILLED * 0.5)
+    filled = within & (uniform_filter(known.astype(np.float64), around) >= _LEAST_AROUND)
     left = plain
     for _ in range(_ROUNDS):
         left = np.where(known, plain - _plane(plain, weight, around), 0.0)
@@ -173,7 +176,7 @@ def _mean_variance(variance: Array, known: Flags, size: int) -> Array:
 
 
 def _robust(values: Array) -> float:
-    return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
+    return MAD_TO_SIGMA * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
 def _scatter(mean: Array, size: int) -> Array:
@@ -186,7 +189,7 @@ def _scatter(mean: Array, size: int) -> Array:
     enough = np.isfinite(parts).mean(axis=2) > 0.1
     all_of_it = _robust(mean[np.isfinite(mean)])
     sheet = np.full((rows, columns), all_of_it)
-    sheet[enough] = 1.4826 * np.nanmedian(parts[enough], axis=1)
+    sheet[enough] = MAD_TO_SIGMA * np.nanmedian(parts[enough], axis=1)
     sheet = median_filter(sheet, 3, mode="nearest")
     return np.repeat(np.repeat(sheet, block, 0), block, 1)[: mean.shape[0], : mean.shape[1]]
 
