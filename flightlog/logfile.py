@@ -7,6 +7,7 @@ most.
 
 import json
 import struct
+import threading
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -209,6 +210,7 @@ class LogReader:
         self._opened: set[int] = set()
         self._counted: set[int] = set()
         self._unpacked = self._records = 0
+        self._turn = threading.Lock()  # seek and read are one: messages may be read by several threads
         try:
             self._file = self.path.open("rb")
         except OSError as error:
@@ -301,8 +303,9 @@ class LogReader:
                 self._topics |= {int(number): topic for number, topic in topics.items()}
 
     def _read(self, offset: int, size: int) -> bytes:
-        self._file.seek(offset)
-        return self._file.read(size)
+        with self._turn:
+            self._file.seek(offset)
+            return self._file.read(size)
 
     def _check_version(self) -> None:
         version = self.metadata.get("swath.log", {}).get("format_version", "")

@@ -17,6 +17,13 @@ _STILL_ACTIVE: Final = 259
 """Of Windows: PROCESS_QUERY_LIMITED_INFORMATION, and the exit code of what runs."""
 
 
+def cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0)) or 1
+    return os.cpu_count() or 1
+
+
 def alive(pid: int) -> bool:
     """Whether a process runs."""
     if os.name == "nt":  # there a signal of 0 would end it

@@ -167,14 +167,14 @@ class _Known:
 
 def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Evidence:
     """What the beams of a stretch passed through."""
-    evidence = freespace.Evidence.none(around.used)
+    lookout = freespace.Lookout(around)
     for points in pieces:
         if len(points):
             origins = Beams.of(points.time_ns, scene.trajectory, scene.mount).origins(points.time_ns)
             voxel = around.of(points.xyz_m)
             slant = around.incidence_deg(points.xyz_m, origins, voxel)
-            freespace.look_along(around, evidence, points.xyz_m, origins, points.time_ns, slant, voxel)
-    return evidence
+            lookout.look_along(points.xyz_m, origins, points.time_ns, slant, voxel)
+    return lookout.evidence
 
 
 def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, int]:

@@ -9,17 +9,20 @@ most beams alone. So a beam counts against a voxel only
 - where it went on for more than a pulse can blur, and than a grazing beam skims.
 
 Beams of one revolution are one look. The rays are taken from the sensor to the echo, through cubes of 2 m, and where something lies in one
-through its voxels: the cost is linear in the length of the beams.
+through its voxels: the cost is linear in the length of the beams. Each cube has 512 bits that say which of its voxels hold points, so that
+an empty one costs no look-up. Threads share the cubes between them: each goes along all rays, and into its own cubes only.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud.surroundings import LOOK_MS, Surroundings, Voxels, find, middle_of
-from groundproc.numerics.voxelhash import voxel_key
+from groundproc.cloud.surroundings import LOOK_MS, Surroundings, Voxels, find, middle_of, signed
+from groundproc.numerics.voxelhash import spread, voxel_key
+from groundproc.system import cores
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -37,7 +40,9 @@ APART_MS: Final = 150
 _ALIKE: Final = np.cos(np.deg2rad(45.0))
 _NOISE_M2: Final = 0.02**2
 _LEVEL: Final = 3
-"""Cubes of 2 m."""
+"""Cubes of 2 m: 8 voxels along a side."""
+_MOST_THREADS: Final = 4
+"""More would go along the same rays for too little."""
 _FARTHER: Final = 1.05
 
 BEFORE, BETWEEN, AFTER, SAME = range(4)
@@ -66,7 +71,16 @@ class Evidence(NamedTuple):
 
 
 class _Maps(NamedTuple):
-    """The voxels and the cubes that they lie in."""
+    """The voxels and the cubes that they lie in.
+
+    Attributes
+    ----------
+    full : ndarray of uint64, shape (cubes, 8)
+        A bit for each voxel of a cube that holds points.
+    part : ndarray of uint8, shape (voxels,)
+        Which thread a voxel belongs to.
+    cube_part : ndarray of uint8, shape (cubes,)
+    """
 
     table: Ints
     voxels: Voxels
@@ -74,6 +88,9 @@ class _Maps(NamedTuple):
     cube_table: Ints
     cube_keys: Times
     cube_m: float
+    full: npt.NDArray[np.uint64]
+    part: npt.NDArray[np.uint8]
+    cube_part: npt.NDArray[np.uint8]
 
 
 class _Rays(NamedTuple):
@@ -86,27 +103,77 @@ class _Rays(NamedTuple):
     voxel: Ints
 
 
-def look_along(
-    around: Surroundings,
-    evidence: Evidence,
-    xyz_m: Array,
-    origins_m: Array,
-    time_ns: Times,
-    incidence_deg: npt.NDArray[np.float32],
-    voxel: Ints,
-) -> None:
-    """Add what the beams of points, shape (n, 3), that lie in voxels, shape (n,), say of all voxels; in the order of time."""
-    cubes = around.levels[_LEVEL]
-    maps = _Maps(around.table, around.voxels, around.edge_m, cubes.table, cubes.voxels.key, cubes.edge_m)
-    rays = _Rays(xyz_m, origins_m, around.elapsed_ms(time_ns), incidence_deg, voxel)
-    _look(rays, maps, evidence)
+class Lookout:
+    """Looks along the beams of a stretch of flight whose planes are known.
+
+    Parameters
+    ----------
+    around : Surroundings
+
+    Attributes
+    ----------
+    evidence : Evidence
+        What was seen so far.
+    """
+
+    def __init__(self, around: Surroundings) -> None:
+        self._around, self.evidence = around, Evidence.none(around.used)
+        self._threads = min(cores(), _MOST_THREADS)
+        cubes = around.levels[_LEVEL]
+        full, cube_part = np.zeros((cubes.used, 8), np.uint64), np.empty(cubes.used, np.uint8)
+        part = np.empty(around.used, np.uint8)
+        _share(around.voxels.key, around.parents[_LEVEL - 1], cubes.voxels.key, self._threads, full, cube_part, part)
+        self._maps = _Maps(
+            around.table,
+            around.voxels,
+            around.edge_m,
+            cubes.table,
+            cubes.voxels.key,
+            cubes.edge_m,
+            full,
+            part,
+            cube_part,
+        )
+
+    def look_along(
+        self, xyz_m: Array, origins_m: Array, time_ns: Times, incidence_deg: npt.NDArray[np.float32], voxel: Ints
+    ) -> None:
+        """Add what the beams of points, shape (n, 3), that lie in voxels, shape (n,), say of all voxels; in the order of time."""
+        rays = _Rays(xyz_m, origins_m, self._around.elapsed_ms(time_ns), incidence_deg, voxel)
+        with ThreadPoolExecutor(self._threads) as pool:
+            for done in [pool.submit(_look, rays, self._maps, self.evidence, each) for each in range(self._threads)]:
+                done.result()
 
 
 @njit(cache=True, nogil=True)
-def _look(rays: _Rays, maps: _Maps, evidence: Evidence) -> None:
+def _share(keys: Any, parent: Any, cube_keys: Any, parts: int, full: Any, cube_part: Any, part: Any) -> None:
+    """Fill in which voxels of each cube hold points, and which thread cubes and voxels belong to."""
+    for w in range(len(cube_part)):
+        cube_part[w] = spread(cube_keys[w]) % parts
+    for v in range(len(part)):
+        w, bit = parent[v], _bit(keys[v] >> 42, keys[v] >> 21, keys[v])
+        full[w, bit >> 6] |= np.uint64(1) << np.uint64(bit & 63)
+        part[v] = cube_part[w]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bit(i: Any, j: Any, k: Any) -> Any:
+    """Number of a voxel within its cube, by its place in voxels."""
+    return (i & 7) << 6 | (j & 7) << 3 | (k & 7)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _key(i: Any, j: Any, k: Any) -> Any:
+    """Key of a voxel by its place in voxels."""
+    return ((i & 0x1FFFFF) << 42) | ((j & 0x1FFFFF) << 21) | (k & 0x1FFFFF)
+
+
+@njit(cache=True, nogil=True)
+def _look(rays: _Rays, maps: _Maps, evidence: Evidence, part: int) -> None:
     unit = np.empty(3)
     for n in range(len(rays.xyz_m)):
-        _note_hit(evidence, rays.voxel[n], rays.time_ms[n])
+        if maps.part[rays.voxel[n]] == part:
+            _note_hit(evidence, rays.voxel[n], rays.time_ms[n])
         if n % EVERY:
             continue
         square = 0.0
@@ -122,7 +189,7 @@ def _look(rays: _Rays, maps: _Maps, evidence: Evidence) -> None:
         cosine = 0.2 if np.isnan(slant) else max(np.cos(np.deg2rad(slant)), 0.02)
         end = length - max(BEYOND_M, SKIMS_M / cosine)
         if end > BEGIN_M:
-            _through_cubes(rays.origin_m[n], unit, end, rays.time_ms[n], maps, evidence)
+            _through_cubes(rays.origin_m[n], unit, end, rays.time_ms[n], maps, evidence, part)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -136,7 +203,7 @@ def _next_wall(place: float, way: float, edge_m: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _through_cubes(origin: Any, unit: Any, end: float, now_ms: int, maps: _Maps, evidence: Evidence) -> None:
+def _through_cubes(origin: Any, unit: Any, end: float, now_ms: int, maps: _Maps, evidence: Evidence, part: int) -> None:
     """Go along a ray from cube to cube (Amanatides and Woo 1987), and through the voxels of those that hold something."""
     x, y, z = (origin[0] + BEGIN_M * unit[0], origin[1] + BEGIN_M * unit[1], origin[2] + BEGIN_M * unit[2])
     next_x, step_x = _next_wall(x, unit[0], maps.cube_m)
@@ -147,8 +214,9 @@ def _through_cubes(origin: Any, unit: Any, end: float, now_ms: int, maps: _Maps,
         out = min(next_x, next_y, next_z, far)
         middle = 0.5 * (at + out)
         key = voxel_key(x + middle * unit[0], y + middle * unit[1], z + middle * unit[2], 1.0 / maps.cube_m)
-        if find(key, maps.cube_table, maps.cube_keys) >= 0:
-            _through_voxels(origin, unit, BEGIN_M + at, BEGIN_M + out, now_ms, maps, evidence)
+        w = find(key, maps.cube_table, maps.cube_keys)
+        if w >= 0 and maps.cube_part[w] == part:
+            _through_voxels(origin, unit, (BEGIN_M + at, BEGIN_M + out), now_ms, maps, evidence, w)
         at = out
         if next_x <= out:
             next_x += step_x
@@ -160,8 +228,13 @@ def _through_cubes(origin: Any, unit: Any, end: float, now_ms: int, maps: _Maps,
 
 @njit(cache=True, nogil=True)
 def _through_voxels(
-    origin: Any, unit: Any, begin: float, end: float, now_ms: int, maps: _Maps, evidence: Evidence
+    origin: Any, unit: Any, between: Any, now_ms: int, maps: _Maps, evidence: Evidence, cube: int
 ) -> None:
+    """Go along a ray from voxel to voxel of one cube."""
+    begin, end = between
+    key = maps.cube_keys[cube]
+    cube_i, cube_j, cube_k = signed(key >> 42), signed(key >> 21), signed(key)
+    per_m, full = 1.0 / maps.edge_m, maps.full[cube]
     x, y, z = (origin[0] + begin * unit[0], origin[1] + begin * unit[1], origin[2] + begin * unit[2])
     next_x, step_x = _next_wall(x, unit[0], maps.edge_m)
     next_y, step_y = _next_wall(y, unit[1], maps.edge_m)
@@ -170,10 +243,16 @@ def _through_voxels(
     while at < far:
         out = min(next_x, next_y, next_z, far)
         middle = 0.5 * (at + out)
-        key = voxel_key(x + middle * unit[0], y + middle * unit[1], z + middle * unit[2], 1.0 / maps.edge_m)
-        v = find(key, maps.table, maps.voxels.key)
-        if v >= 0 and now_ms - evidence.last_ms[v] >= LOOK_MS and _contradicts(origin, unit, maps, v):
-            _note(maps.voxels, evidence, v, now_ms)
+        i = np.int64(np.floor((x + middle * unit[0]) * per_m))
+        j = np.int64(np.floor((y + middle * unit[1]) * per_m))
+        k = np.int64(np.floor((z + middle * unit[2]) * per_m))
+        bit = _bit(i, j, k)
+        # rounding may put a piece of no length into a neighbour, which another thread may have
+        inside = i >> 3 == cube_i and j >> 3 == cube_j and k >> 3 == cube_k
+        if inside and full[bit >> 6] >> np.uint64(bit & 63) & np.uint64(1):
+            v = find(_key(i, j, k), maps.table, maps.voxels.key)
+            if now_ms - evidence.last_ms[v] >= LOOK_MS and _contradicts(origin, unit, maps, v):
+                _note(maps.voxels, evidence, v, now_ms)
         at = out
         if next_x <= out:
             next_x += step_x

@@ -154,11 +154,11 @@ def _square(cube: Cube, place: Place, records: Records, bits: int, upper: _Upper
         order, first = sorted_by(number, len(places))
         del within
         for each, part in enumerate(places):
-            yield from _square(cube, part, records[order[first[each] : first[each + 1]]], bits - 1, upper)
+            yield from _square(cube, part, records.take(order[first[each] : first[each + 1]]), bits - 1, upper)
         return
     number, found = _numbered(*_levels(within, bits, _skipped(place, bits)))
     order, first = sorted_by(number, len(found))
-    records = records[order]
+    records = records.take(order)
     for each, (level, node) in enumerate(found.tolist()):
         key, some = _key(level, node), records[first[each] : first[each + 1]]
         if _ROOT_BITS - level <= bits:

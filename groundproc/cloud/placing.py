@@ -1,5 +1,6 @@
 """The stage that makes the cloud: every shot given its pose, placed, projected and handed on; and what became of each."""
 
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
@@ -13,6 +14,7 @@ from groundproc import geodesy
 from groundproc.cloud import georeference
 from groundproc.cloud.points import Dropped, Points
 from groundproc.cloud.selection import Selection
+from groundproc.readahead import ahead
 from groundproc.sensors.shots import Shots
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -56,7 +58,7 @@ def handed_on(
     sinks: Sequence[Sink],
     selection: Selection,
 ) -> Placed:
-    """Project points of the flight's frame and hand them to the sinks, piece by piece.
+    """Project points of the flight's frame and hand them to the sinks, piece by piece; a thread makes the next one meanwhile.
 
     Parameters
     ----------
@@ -78,16 +80,17 @@ def handed_on(
     for sink in sinks:
         sink.begin()
     count, dropped = 0, Dropped()
-    for points in pieces:
-        dropped = dropped + points.dropped
-        if len(points):
-            project(points, projection)
-            points = selection.of(points)
-        if len(points):
-            count += len(points)
-            for sink in sinks:
-                sink.add(points)
-        del points  # the next piece takes their memory
+    with contextlib.closing(ahead(iter(pieces))) as made:
+        for points in made:
+            dropped = dropped + points.dropped
+            if len(points):
+                project(points, projection)
+                points = selection.of(points)
+            if len(points):
+                count += len(points)
+                for sink in sinks:
+                    sink.add(points)
+            del points  # the next piece takes their memory
     if not count and any(selection.left_out.values()):
         raise CoverageError(_all_left_out(selection, trajectory))
     if not count:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import zstandard
+from numba import njit
 
 from groundproc.numerics.voxelhash import sorted_by
 
@@ -56,14 +57,14 @@ class Spool:
     def add_sorted(self, records: Records, number: npt.NDArray[np.int32], places: list[Place]) -> None:
         """Take records of many squares: number of the square of each, shape (n,), and the squares."""
         order, first = sorted_by(number, len(places))
-        records = records[order]
+        records = records.take(order)  # rows by number copy field by field, a sixth of its speed
         for each, place in enumerate(places):
             self.add(place, records[first[each] : first[each + 1]])
 
     def take(self, place: Place) -> Records:
         """All records of a square, in the order in which they came; they are here no longer."""
         found = list(self.pieces(place))
-        return np.concatenate(found) if found else np.empty(0, self._dtype)
+        return _joined(found) if found else np.empty(0, self._dtype)
 
     def pieces(self, place: Place) -> Iterator[Records]:
         """All records of a square, piece by piece, in the order in which they came; they are here no longer."""
@@ -83,12 +84,30 @@ class Spool:
         at = self._file.tell()
         many = {place for place, parts in self._waiting.items() if sum(map(len, parts)) >= _SMALL}
         for place in many or list(self._waiting):
-            records = np.concatenate(self._waiting.pop(place))
+            records = _joined(self._waiting.pop(place))
             self._bytes -= records.nbytes
             raw = records.view(np.uint8).reshape(len(records), self._dtype.itemsize)
-            packed = self._pack.compress(np.ascontiguousarray(raw.T).data)
+            ranks = np.empty(raw.shape[::-1], np.uint8)
+            _by_rank(raw, ranks)
+            packed = self._pack.compress(ranks.data)
             self._file.write(packed)
             self._pieces.setdefault(place, []).append((at, len(packed)))
             at += len(packed)
         if many and self._bytes > _WAITING_BYTES // 2:  # very many squares with few records each
             self._write()
+
+
+def _joined(parts: list[Records]) -> Records:
+    """Records one after the other, copied as bytes: numpy copies structures field by field."""
+    whole = f"V{parts[0].dtype.itemsize}"
+    return parts[0] if len(parts) == 1 else np.concatenate([each.view(whole) for each in parts]).view(parts[0].dtype)
+
+
+@njit(cache=True, nogil=True)
+def _by_rank(rows: Any, out: Any) -> None:
+    """Bytes of the same rank together, (n, m) to (m, n), in blocks that stay in the nearest cache."""
+    for start in range(0, len(rows), 256):
+        stop = min(start + 256, len(rows))
+        for rank in range(len(out)):
+            for row in range(start, stop):
+                out[rank, row] = rows[row, rank]

@@ -1,5 +1,7 @@
 """The shots of a flight in UTC, piece by piece, and what became of the lidar's packets on the way."""
 
+import contextlib
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -12,6 +14,7 @@ from groundproc.flight import load
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import LidarBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
+from groundproc.readahead import ahead
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate, LaserTable, Shots
 
@@ -22,6 +25,8 @@ Of shorter pieces decoding loses up to a fifth of its speed.
 """
 _SLACK_NS: Final = 10**9
 """A batch belongs to a leg up to so long before and after the leg was received."""
+_READING: Final = threading.Lock()
+"""Streams of one flight share its logs: they are read one at a time."""
 
 
 class LidarClock(Protocol):
@@ -83,6 +88,8 @@ def shots(
 ) -> Iterator[Shots]:
     """Stream the shots of a flight, about half a second at a time; each piece is of one leg and one return mode.
 
+    A thread decodes the next piece while one is used.
+
     Parameters
     ----------
     readers : sequence of LogReader
@@ -97,7 +104,36 @@ def shots(
     progress : callable, optional
         Called with the number of file bytes done since the last call.
     """
-    lidar, tally = lidar_of(readers), tally or Tally()
+    read = 0
+
+    def count(done: int) -> None:
+        nonlocal read
+        read += done
+
+    told = 0
+    with contextlib.closing(
+        ahead(_decoded(readers, timeline, gate, lasers, tally or Tally(), count), _READING)
+    ) as pieces:
+        for piece in pieces:
+            yield piece
+            del piece  # before the next one is waited for
+            if progress is not None and read > told:
+                progress((now := read) - told)
+                told = now
+    if progress is not None and read > told:
+        progress(read - told)
+
+
+def _decoded(
+    readers: Sequence[LogReader],
+    timeline: Sequence[LidarClock],
+    gate: Gate,
+    lasers: LaserTable | None,
+    tally: Tally,
+    progress: Progress,
+) -> Iterator[Shots]:
+    """The shots, piece by piece."""
+    lidar = lidar_of(readers)
     tally.summary = tally.summary or LidarSummary(lidar)
     for batches in _pieces(load.lidar_batches(readers, progress, lidar), lidar, tally):
         packets = load.joined([batch.packets for batch in batches])

@@ -1,0 +1,74 @@
+"""Work done ahead by a thread: the next piece of a stream is made while the last one is used.
+
+That gains time where the work is in kernels and libraries that leave the interpreter to others meanwhile: reading, decoding, placing.
+"""
+
+import contextlib
+import queue
+import threading
+from collections.abc import Generator, Iterator
+from typing import Final, TypeVar
+
+T = TypeVar("T")
+
+_DEPTH: Final = 1
+"""Pieces that wait: one is used, one waits, one is being made."""
+
+
+class _End:
+    """Behind the last item: why there are no more."""
+
+    def __init__(self, error: BaseException | None) -> None:
+        self.error = error
+
+
+def ahead(
+    items: Iterator[T], lock: "contextlib.AbstractContextManager[object] | None" = None
+) -> Generator[T, None, None]:
+    """The items of an iterator, made by a thread of its own that begins with the first one asked for.
+
+    An error of the iterator comes where the item would have come. Left before the end, it is to be closed: then the thread has ended.
+
+    Parameters
+    ----------
+    items : iterator
+        Used by that thread only, and closed by it.
+    lock : context manager, optional
+        Held while an item is made: iterators that share something share one.
+    """
+    made: queue.SimpleQueue[T | _End] = queue.SimpleQueue()
+    room, over = threading.Semaphore(_DEPTH), threading.Event()
+    held = lock or contextlib.nullcontext()
+
+    def work() -> None:
+        error: BaseException | None = None
+        try:
+            while not over.is_set():
+                with held:
+                    item = next(items)
+                made.put(item)
+                del item  # it is the other thread's alone, which may drop it
+                room.acquire()
+        except StopIteration:
+            pass
+        except BaseException as raised:  # whatever it is, it is told where the item was wanted
+            error = raised
+        finally:
+            if isinstance(items, Generator):
+                with contextlib.suppress(Exception), held:
+                    items.close()
+            made.put(_End(error))
+
+    thread = threading.Thread(target=work, name="ahead", daemon=True)
+    thread.start()
+    try:
+        while not isinstance(item := made.get(), _End):
+            yield item
+            del item  # before the next one is waited for
+            room.release()
+        if item.error is not None:
+            raise item.error
+    finally:
+        over.set()
+        room.release()
+        thread.join()

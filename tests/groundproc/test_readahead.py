@@ -1,0 +1,74 @@
+"""Streams made ahead by a thread."""
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from groundproc.readahead import ahead
+
+
+def test_items_come_in_their_order() -> None:
+    assert list(ahead(iter(range(1000)))) == list(range(1000))
+
+
+def test_an_error_comes_where_the_item_would_have_come() -> None:
+    def failing() -> Iterator[int]:
+        yield 1
+        yield 2
+        raise ValueError("the third cannot be made")
+
+    stream = ahead(failing())
+    assert [next(stream), next(stream)] == [1, 2]
+    with pytest.raises(ValueError, match="third"):
+        next(stream)
+
+
+def test_while_one_is_used_two_are_made_and_no_more() -> None:
+    made: list[int] = []
+    second = threading.Event()
+
+    def counted() -> Iterator[int]:
+        for number in range(10):
+            made.append(number)
+            if number == 1:
+                second.set()
+            yield number
+
+    stream = ahead(counted())
+    for number in stream:
+        second.wait()
+        assert len(made) <= number + 3
+    assert made == list(range(10))
+
+
+def test_a_stream_that_is_left_ends_its_thread_and_its_iterator() -> None:
+    closed = threading.Event()
+
+    def endless() -> Iterator[int]:
+        try:
+            while True:
+                yield 0
+        finally:
+            closed.set()
+
+    before = threading.active_count()
+    stream = ahead(endless())
+    next(stream)
+    stream.close()
+    assert closed.is_set()
+    assert threading.active_count() == before
+
+
+def test_streams_that_share_a_lock_are_made_one_at_a_time() -> None:
+    lock, inside = threading.Lock(), []
+
+    def guarded() -> Iterator[bool]:
+        for _ in range(50):
+            inside.append(1)
+            alone = len(inside) == 1
+            inside.pop()
+            yield alone
+
+    pairs = zip(ahead(guarded(), lock), ahead(guarded(), lock), strict=True)
+    assert all(a and b for a, b in pairs)
