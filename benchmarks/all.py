@@ -36,23 +36,24 @@ Written by `make bench` from docs/benchmarks.json. The peers of a benchmark are 
 ratios carry over to other machines, absolute figures do not."""
 
 
-def run(name: str) -> dict[str, Any] | None:
-    """Run one benchmark, its output shown as it comes; the JSON object of its last line, None where it failed."""
+def run(name: str) -> dict[str, Any]:
+    """Run one benchmark, its output shown as it comes: the JSON object of its last line, None where it failed, and its notes."""
     print(f"== {name}", flush=True)
-    last = ""
+    last, notes = "", []
     command = [sys.executable, ROOT / "benchmarks" / f"{name}.py"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             print(line, end="", flush=True)
             last = line if line.strip() else last
-    if process.returncode:
-        return None
+            if line.startswith("note: "):
+                notes.append(line.removeprefix("note: ").strip())
     try:
         figures = json.loads(last)
     except json.JSONDecodeError:
-        return None
-    return figures if isinstance(figures, dict) else None
+        figures = None
+    good = not process.returncode and isinstance(figures, dict)
+    return {"figures": figures if good else None} | ({"notes": notes} if notes else {})
 
 
 def machine() -> str:
@@ -103,6 +104,7 @@ def page(sections: dict[str, Any]) -> str:
         parts += [f"## {name}", f"`make bench-{name}`"]
         parts += [NOTES[name]] if name in NOTES else []
         parts += ["It failed." if section["figures"] is None else table(section["figures"])]
+        parts += ["\n".join(f"- {each}." for each in section["notes"])] if "notes" in section else []
         parts += [f"On {section['machine']}; {section['versions']}."]
     return "\n\n".join(parts) + "\n"
 
@@ -117,7 +119,7 @@ def main() -> int:
     sections = json.loads(FIGURES.read_text()) if FIGURES.is_file() else {}
     chosen = [] if arguments.page else arguments.only or [name for name in every if name not in ON_DEMAND]
     for name in chosen:
-        sections[name] = {"machine": machine(), "versions": versions(), "figures": run(name)}
+        sections[name] = {"machine": machine(), "versions": versions()} | run(name)
         FIGURES.write_text(json.dumps(sections, indent=1, sort_keys=True) + "\n")
     PAGE.write_text(page(sections))
     print(f"written: {PAGE.relative_to(ROOT)}")
