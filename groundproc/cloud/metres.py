@@ -19,10 +19,13 @@ class Metres:
     ----------
     across, up : float
         Of its coordinates, and of its heights.
+    name : str
+        Of the unit of both, as the CRS has it.
     """
 
     across: float = 1.0
     up: float = 1.0
+    name: str = "metre"
 
     @property
     def plain(self) -> bool:
@@ -30,12 +33,15 @@ class Metres:
         return self.across == self.up == 1.0
 
     def of(self, xyz: Array) -> Array:
-        """Coordinates of the CRS in metres, shape (n, 3)."""
+        """Coordinates of the CRS in metres, shape (n, 3) or (3,)."""
         return xyz if self.plain else xyz * (self.across, self.across, self.up)
 
     def back(self, xyz_m: Array) -> Array:
-        """Metres in units of the CRS, shape (n, 3)."""
+        """Metres in units of the CRS, shape (n, 3) or (3,)."""
         return xyz_m if self.plain else xyz_m / (self.across, self.across, self.up)
+
+
+METRES = Metres()
 
 
 def metres_of(cloud: Cloud) -> Metres:
@@ -60,4 +66,5 @@ def metres_of(cloud: Cloud) -> Metres:
         up = float(whole.sub_crs_list[1].axis_info[0].unit_conversion_factor)
     elif whole is not None and len(whole.axis_info) > 2:
         up = float(whole.axis_info[2].unit_conversion_factor)
-    return Metres(across, up)
+    name = str(crs.axis_info[0].unit_name) if crs.axis_info else "metre"
+    return Metres(across, up, name if up == across else f"{name}, heights of {up:.9g} m")

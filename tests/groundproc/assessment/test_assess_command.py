@@ -62,6 +62,9 @@ def test_a_surveyed_marsh_is_judged_as_its_reference_states(tmp_path: Path) -> N
     assert told["rmse"][2] <= 0.0290
     assert told["mean"][2] == pytest.approx(-0.002, abs=0.001)
     assert told["up"]["asprs_2024_class_cm"] == 3
+    # 76 have a point within 5 cm, which says how dense the cloud is; of its accuracy in plan it says nothing
+    assert told["count"][0] == 76
+    assert told["plan"] is None
     alone = assessed(tmp_path, cloud, "--points", csv, "--mode", "plane")
     assert alone["rmse"] == [None, None, told["rmse"][2]]
 
