@@ -80,11 +80,11 @@ def _read(path: Path) -> Iterator[None]:
     """Errors of GDAL as a sentence, and its remarks on pictures without a map left out."""
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        try:
-            yield
-        except RasterioError as error:
-            if not path.exists():
-                raise CaptureError(f"{path}: is not there") from None
-            raise CaptureError(f"{path}: is no picture that can be read ({' '.join(str(error).split())})") from None
+    # for good: filters that are put back when one thread is done are put back for all of them
+    warnings.filterwarnings("ignore", category=NotGeoreferencedWarning)
+    try:
+        yield
+    except RasterioError as error:
+        if not path.exists():
+            raise CaptureError(f"{path}: is not there") from None
+        raise CaptureError(f"{path}: is no picture that can be read ({' '.join(str(error).split())})") from None

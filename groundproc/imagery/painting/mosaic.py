@@ -208,7 +208,8 @@ def _tiles(block: Block, scene: Scene, surface: Surface, grid: Grid, folder: Pat
             )
         ]
         flat = np.broadcast_to(spacing, len(there)), np.broadcast_to(np.float32(_ROUGH_M), len(there))
-        known = Known(kept[4], np.ascontiguousarray(flat[0]), kept[5], np.ascontiguousarray(flat[1]))
+        none = np.zeros(len(there), np.float32)
+        known = Known(kept[4], np.ascontiguousarray(flat[0]), kept[5], np.ascontiguousarray(flat[1]), none)
         radius_m = float(np.sqrt((local**2).sum(axis=1).max()))
         yield _Tile(kept[0], kept[1], kept[2], kept[3], known, centre, radius_m)
 

@@ -129,7 +129,8 @@ def depths_of(block: Block, image: Image, scene: Scene) -> tuple[Depths, list[tu
     spacing_m = float(np.median([square.spacing_m for square, _ in looked]))
     depths = Depths(image.eye, camera.focal_px, spacing_m, float(np.median(ranges)))
     for square, seen in looked:
-        depths.add(seen, scene.spacing_m[square.points][seen.number])
+        depths.add(seen, scene.surface(square), image.eye.place_m - square.centre_m)
+    depths.close()
     return depths, looked
 
 

@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 Array = npt.NDArray[np.float64]
 
@@ -20,6 +21,10 @@ _FLAT: Final = 0.3
 """A plane is no rougher than so much of its smaller extent."""
 _UPRIGHT: Final = 0.3
 """Vertical part of the normal below which a plane is a wall."""
+_SMOOTH: Final = 1.5
+"""A cell that is rougher than so many times the usual may hold more than one surface."""
+_ON: Final = 3.0
+"""Deviations from a neighbouring cell's plane at which a point still lies on it."""
 _STEP_M: Final = 0.75
 _LOWER_M: Final = 0.5
 """A wall looks to the side where the top of everything, so far away from it, is so much lower than on its other side."""
@@ -30,7 +35,8 @@ class Known(NamedTuple):
 
     Attributes
     ----------
-    spacing_m, rough_m : ndarray, shape (n,)
+    spacing_m, rough_m, above_m : ndarray, shape (n,)
+        Distance of neighbours, deviation of points from their plane, and that of this one, along the normal.
     normal : ndarray, shape (n, 3)
         Of length 1 where outwards is known, 1/2 where not, 0 where there is no plane.
     """
@@ -38,39 +44,126 @@ class Known(NamedTuple):
     spacing_m: Array
     normal: Array
     rough_m: Array
+    above_m: Array
+
+
+class _Cells(NamedTuple):
+    """Cells of a grid that hold points, in the order of their keys, and the planes of their points."""
+
+    size_m: float
+    offset: float
+    first: npt.NDArray[np.int64]
+    wide: npt.NDArray[np.int64]
+    key: npt.NDArray[np.int64]
+    points: npt.NDArray[np.int64]
+    normal: Array
+    rough_m: Array
+    middle_m: Array
 
 
 def surfaces(xyz_m: Array) -> tuple[float, Known]:
     """The usual spacing of points, shape (n, 3), and what is known about each.
 
-    Of two grids of cells, one half a cell off: a plane that lies along the border of the cells of one lies within those of the other.
+    Of two grids of cells, one half a cell off: a plane that lies along the border of the cells of one lies within those of the other. A
+    cell at an edge holds points of two surfaces. Those take the best plane among their cell's and its neighbours' that they lie on.
     """
     tops = _tops(xyz_m)
     usual_m = float(np.sqrt(np.count_nonzero(np.isfinite(tops[0])) * _COLUMN_M**2 / len(xyz_m)))
-    known, count = _in_cells(xyz_m, _SIDE * usual_m, 0.0, tops)
-    other, more = _in_cells(xyz_m, _SIDE * usual_m, 0.5, tops)
-    plane, other_plane = (known.normal != 0.0).any(axis=1), (other.normal != 0.0).any(axis=1)
-    better = np.where(plane == other_plane, more > count, other_plane)
-    return usual_m, Known(
-        np.where(better, other.spacing_m, known.spacing_m),
-        np.where(better[:, None], other.normal, known.normal),
-        np.where(better, other.rough_m, known.rough_m),
-    )
+    grids = [_cells(xyz_m, _SIDE * usual_m, offset, tops) for offset in (0.0, 0.5)]
+    smooth = [cells.rough_m[(cells.normal != 0.0).any(axis=1)] for cells, _ in grids]
+    usual_rough_m = float(np.median(np.concatenate(smooth))) if sum(map(len, smooth)) else 0.0
+    score = np.full(len(xyz_m), np.inf)
+    known = Known(np.zeros(len(xyz_m)), np.zeros((len(xyz_m), 3)), np.zeros(len(xyz_m)), np.zeros(len(xyz_m)))
+    for cells, of_point in grids:
+        _assign(xyz_m, of_point, cells, usual_rough_m, score, known)
+    (one, of_one), (other, of_other) = grids
+    fuller = np.maximum(one.points[of_one], other.points[of_other])
+    known.spacing_m[:] = _SIDE * usual_m / np.sqrt(fuller)
+    return usual_m, known
 
 
-def _in_cells(
+def _cells(
     xyz_m: Array, cell_m: float, offset: float, tops: tuple[Array, npt.NDArray[np.int64]]
-) -> tuple[Known, npt.NDArray[np.int64]]:
-    """What the cells of one grid tell of each point, and how many points are in its cell."""
+) -> tuple[_Cells, npt.NDArray[np.int64]]:
+    """The cells of one grid, and the cell of each point."""
     cell = np.floor(xyz_m / cell_m + offset).astype(np.int64)
-    cell -= cell.min(axis=0)
+    first = cell.min(axis=0)
+    cell -= first
     wide = cell.max(axis=0) + 1
-    key = (cell[:, 0] * wide[1] + cell[:, 1]) * wide[2] + cell[:, 2]
-    _, of_point, count = np.unique(key, return_inverse=True, return_counts=True)
+    packed = (cell[:, 0] * wide[1] + cell[:, 1]) * wide[2] + cell[:, 2]
+    key, of_point, count = np.unique(packed, return_inverse=True, return_counts=True)
+    of_point = of_point.reshape(-1)
     normal, rough_m, middle_m = _planes(xyz_m, of_point, count)
-    spacing_m = cell_m / np.sqrt(count)
     normal = _outwards(normal, middle_m, tops)
-    return Known(spacing_m[of_point], normal[of_point], rough_m[of_point]), count[of_point]
+    return _Cells(cell_m, offset, first, wide, key, count, normal, rough_m, middle_m), of_point
+
+
+@njit(cache=True, nogil=True)
+def _assign(xyz_m: Any, of_point: Any, cells: Any, usual_rough_m: float, score: Any, known: Any) -> None:
+    """Give points the best plane of one grid that they lie on, where it is better than what they have.
+
+    A cell that is as smooth as most is no edge, and its points look no farther.
+    """
+    good = np.empty(len(cells.key), np.bool_)
+    for c in range(len(good)):
+        flat = cells.normal[c, 0] != 0.0 or cells.normal[c, 1] != 0.0 or cells.normal[c, 2] != 0.0
+        good[c] = flat and cells.rough_m[c] <= _SMOOTH * usual_rough_m
+    around = np.full((len(cells.key), 27), -1, np.int64)
+    for c in range(len(good)):
+        if good[c]:
+            around[c, 0] = c
+        else:
+            _neighbours(cells, c, around[c])
+    for i in range(len(xyz_m)):
+        for c in around[of_point[i]]:
+            if c >= 0:
+                _offer(xyz_m[i], cells, c, (c == of_point[i], usual_rough_m), score[i : i + 1], known, i)
+
+
+@njit(cache=True, nogil=True)
+def _offer(place: Any, cells: Any, c: int, terms: Any, score: Any, known: Any, point: int) -> None:
+    """Give a point the plane of a cell where it lies on it and this is more certain there than what it has."""
+    own, usual_rough_m = terms
+    square, off, away = 0.0, 0.0, 0.0
+    for axis in range(3):
+        normal, way = cells.normal[c, axis], place[axis] - cells.middle_m[c, axis]
+        square += normal * normal
+        off += normal * way
+        away += way * way
+    if square == 0.0:
+        return
+    off /= np.sqrt(square)
+    rough_m = max(cells.rough_m[c], usual_rough_m)
+    if not own and abs(off) > _ON * rough_m:
+        return
+    # rough planes of few points are uncertain, and those that the point lies away from
+    found = (rough_m**2 * (1.0 + 12.0 * away / cells.size_m**2) + off * off) / cells.points[c] + rough_m**2
+    if found >= score[0]:
+        return
+    score[0] = found
+    known.rough_m[point], known.above_m[point] = rough_m, off
+    for axis in range(3):
+        known.normal[point, axis] = cells.normal[c, axis]
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(cells: Any, c: int, out: Any) -> None:
+    """The cell itself and those of the 26 around it that hold points."""
+    wide, count = cells.wide, 0
+    z = cells.key[c] % wide[2]
+    y = cells.key[c] // wide[2] % wide[1]
+    x = cells.key[c] // (wide[2] * wide[1])
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                i, j, k = x + dx, y + dy, z + dz
+                if i < 0 or j < 0 or k < 0 or i >= wide[0] or j >= wide[1] or k >= wide[2]:
+                    continue
+                key = (i * wide[1] + j) * wide[2] + k
+                place = np.searchsorted(cells.key, key)
+                if place < len(cells.key) and cells.key[place] == key:
+                    out[count] = place
+                    count += 1
 
 
 def _tops(xyz_m: Array) -> tuple[Array, npt.NDArray[np.int64]]:
@@ -101,7 +194,9 @@ def _planes(xyz_m: Array, of_point: npt.NDArray[np.int64], count: npt.NDArray[np
     size, axes = np.linalg.eigh(spread[enough])
     extent = np.sqrt(np.maximum(size, 0.0))
     flat = extent[:, 0] < _FLAT * extent[:, 1]
-    normal[enough[flat]], rough[enough[flat]] = axes[flat, :, 0], extent[flat, 0]
+    # a plane takes three of the points' freedoms
+    free = count[enough][flat] / (count[enough][flat] - 3.0)
+    normal[enough[flat]], rough[enough[flat]] = axes[flat, :, 0], extent[flat, 0] * np.sqrt(free)
     return normal, rough, middle
 
 

@@ -71,6 +71,7 @@ class Scene:
         """Place of each point in the file."""
         self._normal = mapped(folder / "normal", np.float16, (self.size, 3))
         self._rough_m = mapped(folder / "rough", np.float16, (self.size,))
+        self._above_m = mapped(folder / "above", np.float16, (self.size,))
         self.squares: list[Square] = []
         first = 0
         for place in sorted(spool.counts):
@@ -89,7 +90,7 @@ class Scene:
     def _know(self, points: slice, local: Array) -> float:
         """Fill in what follows from the neighbours of points; gives their usual distance."""
         usual_m, known = surfaces(local)
-        self.spacing_m[points], self._normal[points], self._rough_m[points] = known
+        self.spacing_m[points], self._normal[points], self._rough_m[points], self._above_m[points] = known
         return usual_m
 
     def surface(self, square: Square) -> Surface:
@@ -97,7 +98,7 @@ class Scene:
         points = square.points
         return Surface(
             self.xyz_m[points], self.spacing_m[points], self._normal[points].astype(np.float32),
-            self._rough_m[points].astype(np.float32),
+            self._rough_m[points].astype(np.float32), self._above_m[points].astype(np.float32),
         )  # fmt: skip
 
 

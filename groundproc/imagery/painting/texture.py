@@ -134,7 +134,7 @@ def _texels(block: Block, layer: Layer, chart: Chart, sizes_m: tuple[float, floa
     rough = 0.5 * cell_m if chart.steep else _ROUGH_M
     known = Surface(
         local.astype(np.float32), np.full(count, spacing_m, np.float32), chart.normal.astype(np.float32),
-        np.full(count, rough, np.float32),
+        np.full(count, rough, np.float32), np.zeros(count, np.float32),
     )  # fmt: skip
     return _Texels(known, centre, float(np.sqrt((local**2).sum(axis=1).max())), room(count, layer, folder))
 

@@ -1,39 +1,46 @@
-"""Which points an image sees: a depth for each pixel, from discs as wide as the points stand apart, and who stands behind it.
+"""Which points an image sees: a depth for each pixel, from discs that lie in the surface, and who stands behind it.
 
-A point that is nearer than any other in its pixel, within a tolerance, is seen. A disc closes the gaps between points, through which else
-what is behind would show; it is never wider than that, for it would then hide what is beside. The tolerance follows the surface: along
-one that is seen at a grazing angle the points of one pixel lie far one behind the other, and one that turns its back is not seen at
-all, though its edge is as near as the roof that hides it.
+Each point is a small disc in the plane of its neighbours, so that a roof ends where its points end and a wall seen from above has next to
+no width. Points lie anyhow, and through one gap in a hundred between such discs what is behind would show: gaps are closed by
+morphological closing of the depths (of their inverse), which fills what no circle of its size fits into, and takes nothing beyond an edge.
+
+A point is seen if its own plane, along the ray in the middle of its pixel, is as near as that pixel's depth. So the tolerance is one
+across the plane, that of its noise, however grazing the view. One that turns its back is not seen at all, though its edge is as near as
+the roof that hides it.
 """
 
 from typing import Any, Final, NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.imagery.lenses import projected
+from groundproc.imagery.lenses import projected, unproject_all
 
 Array = npt.NDArray[np.float64]
 
-TOLERANCE: Final = 0.001
-"""Share of the distance by which a seen point may be behind the nearest one of its pixel: what poses and lens leave."""
 ROUGH_M: Final = 0.1
-"""The same in metres where there is no plane: leaves, edges."""
+"""By which a seen point may be behind the nearest one of its pixel where there is no plane [m]: leaves, edges."""
 PLANE_M: Final = 0.02
-"""Across a plane, on top of its roughness."""
-_NOISE: Final = 4.0
-"""Roughnesses that the nearest point of a pixel may lie before a plane and another behind it."""
-_DEEPEST_M: Final = 4.0
+"""The same across a plane, on top of its roughness."""
+_NOISE: Final = 2.5
+"""Roughnesses that a plane may be off where points are few."""
+_DEEPEST_M: Final = 0.3
+"""What noise may come to along a ray, however grazing: an eave is so much nearer than the wall that it hides."""
 _GRAZING: Final = 0.02
 _STEEP: Final = 0.5
 """Cosine of the angle to the normal above which a plane that should show its back is taken for a ceiling: seen from below."""
 WIDEST_PX: Final = 6
 """Radius of a disc in the depth image [px of it]: of a lone point near the camera."""
-_REACH: Final = 1.2
-"""Radius of a disc in spacings. Points lie anyhow: at 0.9 three hidden points in a thousand shine through, at 1.2 two in ten thousand."""
-_FINE: Final = 1.5
+_REACH: Final = 0.85
+"""Radius of a disc in spacings: over the half that points keep from an edge, on average."""
+_CLOSED: Final = 1.7
+"""Radius of the circles that fit into no gap, in spacings: with a disc's, points at random leave one gap in 300,000."""
+_FINE: Final = 2.5
 """Pixels of the depth image that points stand apart."""
+_NODES: Final = 32
+"""Places along each side of a picture at which the directions of its rays are known."""
 
 
 class Eye(NamedTuple):
@@ -94,12 +101,15 @@ class Surface(NamedTuple):
         Of length 1 where it points outwards, 1/2 where nobody knows which side that is, 0 where there is no plane.
     rough_m : ndarray of float16, shape (n,)
         Standard deviation across the plane.
+    above_m : ndarray of float16, shape (n,)
+        How far the point lies off its plane, along the normal.
     """
 
     xyz_m: npt.NDArray[np.float32]
     spacing_m: npt.NDArray[np.float32]
     normal: npt.NDArray[np.float32]
     rough_m: npt.NDArray[np.float32]
+    above_m: npt.NDArray[np.float32]
 
 
 class Depths:
@@ -117,9 +127,13 @@ class Depths:
         apart_px = focal_px * spacing_m / max(range_m, 0.1)
         self._scale = min(1.0, _FINE / max(apart_px, 1e-6))
         self._focal = focal_px * self._scale
+        self._gap_px = _CLOSED * apart_px * self._scale
         width, height = (int(np.ceil(side * self._scale)) + 1 for side in eye.size_px)
         self.nearest = np.full((height, width), np.inf, np.float32)
         """Distance to the nearest point for each of its pixels [m]; infinite where there is none."""
+        self._facing = np.zeros((height, width), np.float32)
+        """Cosine of the angle between its ray and the normal of the plane there; 0 where nobody knows."""
+        self._turning = _turning(eye) / self._scale
 
     def at(self, pixel: Array) -> npt.NDArray[np.float32]:
         """The distance to the nearest point at pixels of the picture, shape (n, 2)."""
@@ -128,12 +142,8 @@ class Depths:
         places = np.clip(row, 0, height - 1).astype(np.intp), np.clip(column, 0, width - 1).astype(np.intp)
         return np.asarray(self.nearest[places])
 
-    def add(self, seen: Seen, spacing_m: npt.NDArray[np.float32]) -> None:
-        """Take points, with the distances to their neighbours, shape (k,)."""
-        _splat(seen.pixel, seen.range_m, spacing_m, self._focal, self._scale, self.nearest)
-
-    def sees(self, seen: Seen, surface: Surface, place_m: Array) -> npt.NDArray[np.bool_]:
-        """Which of some points nothing hides, shape (k,).
+    def add(self, seen: Seen, surface: Surface, place_m: Array) -> None:
+        """Take points.
 
         Parameters
         ----------
@@ -143,9 +153,46 @@ class Depths:
         place_m : ndarray, shape (3,)
             Projection centre in the frame of their coordinates.
         """
+        _splat(seen, surface, place_m, (self._scale, self._focal), self._turning, (self.nearest, self._facing))
+
+    def close(self) -> None:
+        """Close the gaps between all points, once they are in."""
+        radius = int(np.ceil(self._gap_px - 0.25))
+        if radius < 1:
+            return
+        down, right = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+        circle = (np.hypot(down, right) <= self._gap_px + 0.25).astype(np.uint8)
+        with np.errstate(divide="ignore"):
+            # beyond its sides the picture goes on as it ends there; else slopes would be lifted along them
+            rim = 2 * radius
+            near = np.asarray(cv2.copyMakeBorder(1.0 / self.nearest, rim, rim, rim, rim, cv2.BORDER_REPLICATE))
+            closed = np.asarray(cv2.morphologyEx(near, cv2.MORPH_CLOSE, circle))[rim:-rim, rim:-rim]
+            self.nearest = np.minimum(self.nearest, 1.0 / closed)
+
+    def sees(self, seen: Seen, surface: Surface, place_m: Array) -> npt.NDArray[np.bool_]:
+        """Which of some points nothing hides, shape (k,); parameters as of `add`."""
         out = np.empty(len(seen.number), np.bool_)
-        _sees(seen, surface, place_m, (self._scale, self._focal), self.nearest, out)
+        _sees(seen, surface, place_m, (self._scale, self._focal), self._turning, (self.nearest, self._facing), out)
         return out
+
+
+def _turning(eye: Eye) -> Array:
+    """How rays turn from pixel to pixel, to the right and down, at nodes over the picture, shape (nodes, nodes, 2, 3), in the local frame.
+
+    0 where the lens does not reach.
+    """
+    across, down = ((np.arange(_NODES) + 0.5) / _NODES * side - 0.5 for side in eye.size_px)
+    u, v = np.meshgrid(across, down)
+    rays = []
+    for right, below in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        pixels = np.stack([u.ravel() + right, v.ravel() + below], axis=1)
+        ray, reached = np.empty((len(pixels), 3)), np.empty(len(pixels), np.bool_)
+        unproject_all(eye.kind, eye.lens, pixels, ray, reached)
+        ray[~reached] = np.nan
+        rays.append(ray)
+    steps = np.stack([0.5 * (rays[0] - rays[1]), 0.5 * (rays[2] - rays[3])], axis=1)
+    found = np.nan_to_num(steps) @ eye.mat_cam_local
+    return np.ascontiguousarray(found.reshape(_NODES, _NODES, 2, 3))
 
 
 @njit(cache=True, nogil=True)
@@ -167,45 +214,110 @@ def _project(eye: Any, xyz: Any, number: Any, pixel: Any, ranges: Any) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _splat(pixel: Any, ranges: Any, spacing: Any, focal: float, scale: float, nearest: Any) -> None:
+def _node(pixel: Any, scale: float, nearest: Any) -> tuple[int, int]:
+    """Row and column of the node that a pixel is next to."""
+    row = int((pixel[1] + 0.5) * scale / nearest.shape[0] * _NODES)
+    column = int((pixel[0] + 0.5) * scale / nearest.shape[1] * _NODES)
+    return min(max(row, 0), _NODES - 1), min(max(column, 0), _NODES - 1)
+
+
+@njit(cache=True, nogil=True)
+def _facing(surface: Any, point: int, place: Any, turning: Any, out: Any) -> bool:
+    """The plane of a point as rays meet it: cosine, its changes from pixel to pixel, distance across; False where it has none.
+
+    The distance along the ray so many pixels to the right and below that of the point is
+    out[3] / (out[0] + out[1] right + out[2] below). out[4:7] is the way to the point.
+    """
+    square = 0.0
+    out[:4] = 0.0
+    for axis in range(3):
+        normal = np.float64(surface.normal[point, axis])
+        way = surface.xyz_m[point, axis] - place[axis]
+        square += normal * normal
+        out[0] += normal * way
+        out[1] += normal * turning[0, axis]
+        out[2] += normal * turning[1, axis]
+        out[4 + axis] = way
+    if square < 0.1:
+        return False
+    length = np.sqrt(square)
+    distance = np.sqrt(out[4] ** 2 + out[5] ** 2 + out[6] ** 2)
+    out[3] = out[0] / length - surface.above_m[point]
+    out[0] /= length * distance
+    out[1] /= length
+    out[2] /= length
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any) -> None:
+    nearest, facing = depths
     height, width = nearest.shape
-    for i in range(len(ranges)):
-        radius = min(_REACH * spacing[i] * focal / ranges[i], WIDEST_PX)
-        u, v = (pixel[i, 0] + 0.5) * scale, (pixel[i, 1] + 0.5) * scale
+    scale, focal = scales
+    plane = np.empty(7)
+    for i in range(len(seen.number)):
+        point, distance = seen.number[i], float(seen.range_m[i])
+        reach = min(_REACH * surface.spacing_m[point], WIDEST_PX * distance / focal)
+        radius = reach * focal / distance
+        u, v = (seen.pixel[i, 0] + 0.5) * scale, (seen.pixel[i, 1] + 0.5) * scale
+        down, across = _node(seen.pixel[i], scale, nearest)
+        turn = turning[down, across]
+        flat = _facing(surface, point, place, turn, plane)
         left, right = max(0, int(u - radius)), min(width - 1, int(u + radius))
         top, bottom = max(0, int(v - radius)), min(height - 1, int(v + radius))
-        square = radius * radius
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
                 du, dv = column + 0.5 - u, row + 0.5 - v
-                own = row == int(v) and column == int(u)
-                if (own or du * du + dv * dv <= square) and ranges[i] < nearest[row, column]:
-                    nearest[row, column] = ranges[i]
+                far, cosine = distance, 0.0
+                if flat:
+                    cosine = plane[0] + du * plane[1] + dv * plane[2]
+                    far = plane[3] / cosine if cosine != 0.0 else np.inf
+                    off = 0.0
+                    for axis in range(3):
+                        ray = plane[4 + axis] / distance + du * turn[0, axis] + dv * turn[1, axis]
+                        off += (far * ray - plane[4 + axis]) ** 2
+                    inside = off <= reach * reach
+                else:
+                    inside = du * du + dv * dv <= radius * radius
+                if not inside:
+                    if row != int(v) or column != int(u):
+                        continue
+                    far = distance
+                if far < nearest[row, column]:
+                    nearest[row, column], facing[row, column] = far, abs(cosine)
 
 
 @njit(cache=True, nogil=True)
-def _sees(seen: Any, surface: Any, place: Any, scales: Any, nearest: Any, out: Any) -> None:
+def _sees(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any, out: Any) -> None:
+    nearest, facing = depths
     scale, focal = scales
+    plane = np.empty(7)
     for i in range(len(seen.range_m)):
-        point, distance = seen.number[i], seen.range_m[i]
-        row, column = int((seen.pixel[i, 1] + 0.5) * scale), int((seen.pixel[i, 0] + 0.5) * scale)
-        behind = distance - nearest[row, column]
-        aside = _REACH * surface.spacing_m[point] + distance / focal  # of the nearest one from this one, at most
-        out[i] = behind <= TOLERANCE * distance + _slack(surface, point, place, distance, aside)
+        point, distance = seen.number[i], np.float64(seen.range_m[i])
+        u, v = (seen.pixel[i, 0] + 0.5) * scale, (seen.pixel[i, 1] + 0.5) * scale
+        row, column = int(v), int(u)
+        down, across = _node(seen.pixel[i], scale, nearest)
+        near = np.float64(nearest[row, column])
+        if not _facing(surface, point, place, turning[down, across], plane):
+            aside = _REACH * surface.spacing_m[point] + distance / focal  # of the nearest one from this one, at most
+            out[i] = distance - near <= ROUGH_M + 0.5 * aside
+            continue
+        known = _length2(surface, point) > 0.5
+        if known and 0.0 < plane[0] < _STEEP:
+            out[i] = False
+            continue
+        reach = _REACH * surface.spacing_m[point]
+        cosine = plane[0] + (column + 0.5 - u) * plane[1] + (row + 0.5 - v) * plane[2]
+        far = plane[3] / cosine if abs(cosine) >= _GRAZING else distance
+        far = min(max(far, distance - reach), distance + reach)  # farther along the plane there may be no surface
+        # neither may lie off the other's plane: an eave is near the plane of the wall below it, not so the wall
+        across = max(abs(cosine), np.float64(facing[row, column]), _GRAZING)
+        slack = PLANE_M + _NOISE * surface.rough_m[point]
+        out[i] = far - near <= min(slack / across, _DEEPEST_M)
 
 
 @njit(cache=True, nogil=True)
-def _slack(surface: Any, point: int, place: Any, distance: float, aside: float) -> float:
-    """How far behind the nearest one of its pixel a seen point may be [m]; below 0 where it cannot be seen."""
-    cosine, square = 0.0, 0.0
-    for axis in range(3):
-        normal = np.float64(surface.normal[point, axis])
-        cosine += normal * (place[axis] - surface.xyz_m[point, axis])
-        square += normal * normal
-    if square < 0.1:
-        return ROUGH_M + 0.5 * aside
-    cosine /= distance * np.sqrt(square)
-    if square > 0.5 and cosine < 0.0 and cosine > -_STEEP:
-        return -_DEEPEST_M
-    across = PLANE_M + _NOISE * surface.rough_m[point] + aside * np.sqrt(max(0.0, 1.0 - cosine * cosine))
-    return float(min(across / max(abs(cosine), _GRAZING), _DEEPEST_M))
+def _length2(surface: Any, point: int) -> float:
+    """Square of the length of a point's normal."""
+    x, y, z = surface.normal[point, 0], surface.normal[point, 1], surface.normal[point, 2]
+    return float(x * x + y * y + z * z)
