@@ -24,7 +24,7 @@ ROUGH_M: Final = 0.1
 """By which a seen point may be behind the nearest one of its pixel where there is no plane [m]: leaves, edges."""
 PLANE_M: Final = 0.02
 """The same across a plane, on top of its roughness."""
-_NOISE: Final = 2.5
+_NOISE: Final = 3.5
 """Roughnesses that a plane may be off where points are few."""
 _DEEPEST_M: Final = 0.3
 """What noise may come to along a ray, however grazing: an eave is so much nearer than the wall that it hides."""
