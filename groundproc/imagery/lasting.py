@@ -1,66 +1,184 @@
 """Errors of a trajectory last: poses seconds apart are off alike, and a hundred of them say little more than one.
 
 How long is told by the block: held by its images and hardly by the trajectory, it is rigid, and the trajectory's departures from it follow
-each other where errors last. With the correlation r from one station to the next, variances are multiplied by (1 + r) / (1 - r), which the
-mean of an autoregressive process of first order has (spectrum at frequency zero). Independent errors stay as they are.
+each other where errors last. They are taken for a Markov process of first order, whose time constant and size are the likeliest ones with
+everything else, the poses, points, mounting and clocks, integrated out (restricted likelihood, Patterson & Thompson 1971): how well the
+images know the shape of the block is in it. Independent errors stay as they are.
 """
 
-from dataclasses import replace
+import itertools
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import cho_factor, solve_triangular
 
 from groundproc.imagery.bundle.block import Block, PosePriors
-from groundproc.imagery.bundle.observed import pose_residuals
-from groundproc.numerics import robust
+from groundproc.imagery.bundle.observed import add_dense, bare_rows, what_is_new, whitening
+from groundproc.imagery.bundle.screen import Adjusted
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 LOOSE: Final = 100.0
 """What variances are multiplied by while the block tells."""
-MOST: Final = 0.95
 LEAST_STATIONS: Final = 8
+LONGEST_S: Final = 60.0
+"""Errors that last longer are those of the block as a whole, and nothing in it tells them."""
+TAUS: Final = 7
+SIZES: Final = (1.0, 1.7, 3.0, 5.0, 9.0, 15.0, 25.0)
+"""Time constants and multiples of variances that are tried."""
+MOST_STATIONS: Final = 80
+"""The first so many tell."""
+MOST_KEPT: Final = 0.9999
+BY_CHANCE: Final = 3.0
+"""Logarithm of likelihood that a time constant and a size have to gain."""
 
 
-def loosened(priors: PosePriors, place: Array | float, turn: Array | float) -> PosePriors:
-    """Observed poses with the variances of places and turns multiplied, all alike or each by its own, shape (k,)."""
-    count = len(priors)
-    scale = np.sqrt(np.stack([np.broadcast_to(place, count)] * 3 + [np.broadcast_to(turn, count)] * 3, axis=1))
+@dataclass(frozen=True, slots=True)
+class Lasting:
+    """How the errors of a trajectory hang together.
+
+    Attributes
+    ----------
+    place_s, turn_s : float
+        Time constants; 0 for errors that are independent.
+    place, turn : float
+        What variances are multiplied by.
+    """
+
+    place_s: float = 0.0
+    turn_s: float = 0.0
+    place: float = 1.0
+    turn: float = 1.0
+
+
+HARDLY: Final = Lasting(place=LOOSE, turn=LOOSE)
+
+
+def applied(block: Block, lasting: Lasting) -> Block:
+    """The block with observed poses, as the trajectory states them, whose errors last."""
+    priors = block.priors
+    scale = np.sqrt([lasting.place] * 3 + [lasting.turn] * 3)
     finite = np.isfinite(priors.covariance)
-    spread = np.where(finite, priors.covariance, 0.0) * (scale[:, :, None] * scale[:, None, :])
-    return replace(priors, covariance=np.where(finite, spread, priors.covariance))
+    spread = np.where(finite, priors.covariance, 0.0) * (scale[:, None] * scale[None, :])
+    priors = replace(priors, covariance=np.where(finite, spread, priors.covariance), before=None, keep=None)
+    if lasting.place_s or lasting.turn_s:
+        time_ns = block.stations.time_ns[priors.station]
+        order = np.argsort(time_ns, kind="stable")
+        before = np.full(len(priors), -1)
+        before[order[1:]] = order[:-1]
+        keep = _kept((time_ns - time_ns.min()) * 1e-9, before, lasting)
+        priors = replace(priors, before=before, keep=keep)
+    return replace(block, priors=priors)
 
 
-def factors(block: Block, stated: PosePriors) -> tuple[Array, Array]:
-    """What variances of places and of turns are to be multiplied by, shape (k,) each.
+def told_by(adjusted: Adjusted, stated: PosePriors) -> Lasting:
+    """How long the trajectory's errors last, and how large they are.
 
     Parameters
     ----------
-    block : Block
-        Adjusted with loosened poses.
+    adjusted : Adjusted
+        With poses that are hardly believed.
     stated : PosePriors
-        With the variances as the trajectory states them.
+        As the trajectory states them.
     """
-    count = len(stated)
-    if count < LEAST_STATIONS:
-        return np.ones(count), np.ones(count)
-    order = np.argsort(block.stations.time_ns[stated.station], kind="stable")
-    off = pose_residuals(block, stated) / np.sqrt(np.diagonal(stated.covariance, axis1=1, axis2=2))
-    place, turn = off[:, :3], off[:, 3:]
-    return _factor(place[order]) * np.ones(count), _factor(turn[order]) * np.ones(count)
+    return likeliest(Told.of(adjusted, stated)) if len(stated) >= LEAST_STATIONS else Lasting()
 
 
-def _factor(series: Array) -> float:
-    """(1 + r) / (1 - r) of series, shape (n, m), side by side; 1 where r is what independent deviates have by chance."""
-    centred = series - np.median(series, axis=0)
-    # a wild pose is not what lasts
-    limit = 4.0 * robust.MAD_TO_SIGMA * np.maximum(np.median(np.abs(centred), axis=0), 1e-12)
-    centred = np.clip(centred, -limit, limit)
-    square = float(np.square(centred).sum())
-    if square == 0.0:
-        return 1.0
-    ratio = float((centred[1:] * centred[:-1]).sum()) / square
-    chance = 2.0 / np.sqrt(series.size)
-    ratio = min(max(ratio, 0.0), MOST) if ratio > chance else 0.0
-    return (1.0 + ratio) / (1.0 - ratio)
+def likeliest(told: "Told") -> Lasting:
+    """What makes the observed poses likeliest; independent errors as stated where that is as good, but for chance."""
+    step_s = float(np.median(np.diff(told.time_s)))
+    taus_s = [0.0, *np.geomspace(max(0.4 * step_s, 1e-3), max(LONGEST_S, step_s), TAUS).tolist()]
+    best = Lasting()
+    likelihood = told.likelihood(best)
+    for what in ("place", "turn", "place"):
+        trials = [replace(best, **{what: size, f"{what}_s": tau_s}) for size, tau_s in itertools.product(SIZES, taus_s)]
+        found = [told.likelihood(trial) for trial in trials]
+        first = int(np.argmax(found))
+        if found[first] > likelihood + BY_CHANCE:
+            best, likelihood = trials[first], found[first]
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the images say of stations and clocks, everything else integrated out, about an adjusted block.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (k,)
+        Of the observed poses, in order.
+    residual, by, columns : ndarray, shape (k, 6), (k, 6, 7) and (k, 7)
+        Their rows, in metres and radians.
+    white : ndarray, shape (k, 6, 6)
+        What makes independent errors of stated size unit ones.
+    matrix, gradient : ndarray, shape (n, n) and (n,)
+        Half the sum of squares of the image points is half of x' matrix x + gradient x.
+    """
+
+    time_s: Array
+    residual: Array
+    by: Array
+    columns: Ints
+    white: Array
+    matrix: Array
+    gradient: Array
+
+    @classmethod
+    def of(cls, adjusted: Adjusted, stated: PosePriors) -> "Told":
+        """From a block adjusted with poses that are hardly believed, whose share is taken off again."""
+        block, unknowns = adjusted.solved.block, adjusted.solved.unknowns
+        time_ns = block.stations.time_ns[stated.station]
+        chosen = np.argsort(time_ns, kind="stable")[:MOST_STATIONS]
+        weight = np.sqrt(block.priors.weight)[:, None, None]
+        loose, own = (
+            (bare_rows(replace(block, priors=priors), unknowns), whitening(priors.covariance) * weight)
+            for priors in (block.priors, stated)
+        )
+        used = np.unique(own[0][2][chosen])
+        used = used[used >= 0]
+        place = np.full(unknowns.size + 1, -1)
+        place[used] = np.arange(len(used))
+        made = [
+            cls(
+                (time_ns[chosen] - time_ns.min()) * 1e-9, residual[chosen], by[chosen], place[columns[chosen]], white[chosen],
+                np.zeros((len(used), len(used))), np.zeros(len(used)),
+            )
+            for (residual, by, columns), white in (loose, own)
+        ]  # fmt: skip
+        matrix, gradient, _ = made[0].poses(Lasting())
+        inverse = np.linalg.inv(adjusted.found.matrix[np.ix_(used, used)])
+        return replace(made[1], matrix=inverse - matrix, gradient=-gradient)
+
+    def poses(self, lasting: Lasting) -> tuple[Array, Array, float]:
+        """Normal matrix and gradient of observed poses, and the sum of their squares."""
+        white = self.white / np.sqrt([lasting.place] * 3 + [lasting.turn] * 3)
+        residual, by, columns = np.einsum("kij,kj->ki", white, self.residual), white @ self.by, self.columns
+        before = np.arange(len(residual)) - 1
+        if lasting.place_s or lasting.turn_s:
+            residual, by, columns = what_is_new(before, _kept(self.time_s, before, lasting), residual, by, columns)
+        matrix, gradient = np.zeros_like(self.matrix), np.zeros_like(self.gradient)
+        add_dense(matrix, gradient, residual, by, columns)
+        return matrix, gradient, float(np.square(residual).sum())
+
+    def likelihood(self, lasting: Lasting) -> float:
+        """Logarithm of the likelihood of the poses, but for what does not depend on how their errors last."""
+        matrix, gradient, square = self.poses(lasting)
+        lower, _ = cho_factor(matrix + self.matrix, lower=True)
+        pulled = solve_triangular(lower, gradient + self.gradient, lower=True)
+        count = len(self.time_s)
+        kept = _kept(self.time_s, np.arange(count) - 1, lasting)[1:]
+        spread = np.log(np.diag(lower)).sum() + 1.5 * count * np.log(lasting.place * lasting.turn)
+        spread += 1.5 * np.log(1.0 - kept**2).sum()
+        return float(0.5 * (pulled @ pulled - square) - spread)
+
+
+def _kept(time_s: Array, before: Ints, lasting: Lasting) -> Array:
+    """What is left of errors of place and turn at the pose before, shape (k, 2)."""
+    since_s = np.where(before >= 0, time_s - time_s[before], np.inf)
+    taus_s = (lasting.place_s, lasting.turn_s)
+    keep = [np.exp(-since_s / tau_s) if tau_s else np.zeros(len(time_s)) for tau_s in taus_s]
+    # two images at once have one error, but a pose that is quite the same would make the matrix singular
+    return np.asarray(np.minimum(np.stack(keep, axis=1), MOST_KEPT))

@@ -16,6 +16,7 @@ from groundproc.imagery.assembly import Known
 from groundproc.imagery.exifrig import rig_of
 from groundproc.imagery.exposures import exposures_of
 from groundproc.imagery.imports import load_rig
+from groundproc.imagery.lasting import Lasting
 from groundproc.imagery.logged import trajectory_of
 from groundproc.imagery.measurements import rows_of
 from groundproc.imagery.photos import Picture, files_of, look
@@ -92,8 +93,8 @@ class Session:
     site : Site
     timed : Timed, optional
         By which events times were found.
-    lasting : tuple of float or ndarray
-        What variances of the trajectory's places and turns are multiplied by, because its errors last.
+    lasting : Lasting
+        How the trajectory's errors hang together.
     warnings : list of str
     left_out : dict
         Images that are not in the block, and why.
@@ -110,7 +111,7 @@ class Session:
     trajectory: Trajectory | None = None
     site: Site = field(default_factory=lambda: cartesian(np.zeros((1, 3))))
     timed: Timed | None = None
-    lasting: tuple[Array | float, Array | float] = (1.0, 1.0)
+    lasting: Lasting = field(default_factory=Lasting)
     warnings: list[str] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
 

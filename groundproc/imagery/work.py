@@ -1,7 +1,7 @@
 """`swath images` as a whole: what is given is read, tied together, adjusted and written."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from groundproc.imagery.poses import NO_TIME
 from groundproc.imagery.rig import RigCamera
 from groundproc.imagery.session import Progress, Session, Task, begin, known_of, names_listed
 from groundproc.imagery.surface import Surface, held_to, read_surface
+from groundproc.imagery.thinning import completed, renewed, thinned
 from groundproc.imagery.ties import Features, features_of, match_all, pairs_of
 from groundproc.imagery.tracks import tracks_of
 from groundproc.trajectory.trajectory import Trajectory
@@ -102,46 +103,55 @@ def _features(session: Session, progress: Progress) -> list[Features | None]:
 def _adjusted(
     session: Session, made: Assembled, measured: Measurements, surface: Surface | None, progress: Progress
 ) -> tuple[Adjusted, dict[str, Any]]:
-    """Adjust in rounds: mounting held, then what held-out views accept of it, with clocks, and the lidar's surface."""
+    """Adjust in rounds: mounting held, then what held-out views accept of it, with clocks, and the lidar's surface.
+
+    On a trajectory all rounds but the last go by the tie points that tell most.
+    """
     matched = measured.matched[made.measured]
 
     def told(step: int, cost: float) -> None:
         progress("adjusted", 1)
 
     known = made.block.rig.cameras
-    adjusted = adjust(made.block, known, matched, told)
-    more: dict[str, Any] = {}
-    block = adjusted.solved.block
-    if session.trajectory is not None:
-        mounting, more["held_out"] = gate.accepted(block, known)
-        block = replace(block, mounting=mounting)
-        adjusted = _settled(session, _renewed(block), known, matched, told)
-        more["lasting"] = {
-            name: float(np.median(value)) for name, value in zip(("place", "turn"), session.lasting, strict=True)
-        }
+    if session.trajectory is None:
+        adjusted = adjust(made.block, known, matched, told)
+        return (adjusted if surface is None else _on_surface(adjusted, surface, known, matched, told)), {}
+    few = thinned(made.block, matched)
+    block = replace(made.block, measured=made.block.measured.masked(few))
+    adjusted = adjust(block, known, matched[few], told)
+    mounting, held_out = gate.accepted(adjusted.solved.block, known)
+    block = replace(adjusted.solved.block, mounting=mounting)
+    adjusted = _settled(session, block, known, matched[few], told)
     if surface is not None:
-        for _ in range(2):
-            adjusted = adjust(held_to(adjusted.solved.block, surface), known, matched, told)
-        if session.trajectory is not None:
-            adjusted = _with_clocks(session, adjusted, known, matched, told)
-    return adjusted, more
+        adjusted = _on_surface(adjusted, surface, known, matched[few], told)
+        adjusted = _with_clocks(session, adjusted, known, matched[few], told)
+    if not few.all():
+        block = completed(adjusted.solved.block, made.block, matched, adjusted.sigma_px)
+        adjusted = adjust(block if surface is None else held_to(block, surface), known, matched, told, begun=True)
+    return adjusted, {"held_out": held_out, "lasting": asdict(session.lasting)}
+
+
+def _on_surface(
+    adjusted: Adjusted, surface: Surface, known: tuple[RigCamera, ...], matched: Mask, told: Any
+) -> Adjusted:
+    """Adjusted with tie points held to the lidar's planes, which are taken anew once heights are right."""
+    for _ in range(2):
+        adjusted = adjust(held_to(adjusted.solved.block, surface), known, matched, told, begun=True)
+    return adjusted
 
 
 def _settled(session: Session, block: Block, known: tuple[RigCamera, ...], matched: Mask, told: Any) -> Adjusted:
     """Adjusted with the trajectory's errors as long as they last: the block is first held loosely, and tells."""
     assert session.trajectory is not None
-    loose = replace(block, priors=lasting.loosened(block.priors, lasting.LOOSE, lasting.LOOSE))
-    session.lasting = (lasting.LOOSE, lasting.LOOSE)
-    first = _with_clocks(session, adjust(loose, known, matched, told), known, matched, told).solved.block
-    stated = flown.resampled(session.trajectory, first)
-    session.lasting = lasting.factors(stated, stated.priors)
-    block = replace(stated, priors=lasting.loosened(stated.priors, *session.lasting))
-    return _with_clocks(session, adjust(block, known, matched, told), known, matched, told)
-
-
-def _renewed(block: Block) -> Block:
-    """A block whose wrong matches get another chance, now that more of it is known."""
-    return replace(block, measured=replace(block.measured, weight=np.ones(len(block.measured))))
+    session.lasting = lasting.HARDLY
+    loose = lasting.applied(block, session.lasting)
+    # the mounting is free now: wrong matches get another chance
+    adjusted = adjust(renewed(loose), known, matched, told)
+    first = _with_clocks(session, adjusted, known, matched, told)
+    stated = flown.resampled(session.trajectory, first.solved.block)
+    session.lasting = lasting.told_by(first, stated.priors)
+    adjusted = adjust(lasting.applied(stated, session.lasting), known, matched, told, begun=True)
+    return _with_clocks(session, adjusted, known, matched, told)
 
 
 def _with_clocks(
@@ -158,9 +168,8 @@ def _with_clocks(
         ):
             break
         before = now
-        block = flown.resampled(session.trajectory, block)
-        block = replace(block, priors=lasting.loosened(block.priors, *session.lasting))
-        adjusted = adjust(block, known, matched, told)
+        block = lasting.applied(flown.resampled(session.trajectory, block), session.lasting)
+        adjusted = adjust(block, known, matched, told, begun=True)
     return adjusted
 
 

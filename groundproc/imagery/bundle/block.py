@@ -147,6 +147,10 @@ class PosePriors:
         What a millisecond of the camera's clock moves.
     weight : ndarray, shape (k,)
         Robust.
+    before : ndarray of int64, shape (k,), optional
+        Row of the pose before each in time, -1 for none; absent: all poses are independent.
+    keep : ndarray, shape (k, 2), optional
+        Correlation of errors of place and of turn, in units of their sigmas, with those of the pose before.
     """
 
     station: Ints
@@ -157,6 +161,8 @@ class PosePriors:
     velocity_m_s: Array
     turning_rad_s: Array
     weight: Array
+    before: Ints | None = None
+    keep: Array | None = None
 
     def __len__(self) -> int:
         return len(self.station)

@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from flightlog.errors import CoverageError
 from groundproc.imagery.bundle.block import CONTROL, Block
-from groundproc.imagery.bundle.observed import known_rows, whitening
+from groundproc.imagery.bundle.observed import known_rows, pose_rows
 from groundproc.imagery.bundle.schur import point_cofactors
 from groundproc.imagery.bundle.solve import Normal, Solved, normal_of
 from groundproc.imagery.bundle.unknowns import Unknowns, lens_names
@@ -190,12 +190,10 @@ def traces(solved: Solved, found: Cofactors) -> tuple[float, float]:
     """How many unknowns' worth the observed poses, and the rows of points, determine: traces of their shares of the normal matrix."""
     block = solved.block
     poses = 0.0
-    priors = block.priors
-    if len(priors):
-        white = whitening(priors.covariance) * np.sqrt(priors.weight)[:, None, None]
-        for weight, station in zip(white, priors.station, strict=True):
-            part = of_columns(found.matrix, solved.unknowns.station[station])
-            poses += float(np.trace(weight @ part @ weight.T))
+    if len(block.priors):
+        _, by, columns = pose_rows(block, solved.unknowns)
+        for row, own in zip(by, columns, strict=True):
+            poses += float(np.trace(row @ of_columns(found.matrix, own) @ row.T))
     rows = block.rows
     if not len(rows):
         return poses, 0.0

@@ -36,23 +36,44 @@ def whitening(covariance: Array) -> Array:
     return out
 
 
-def pose_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
-    """Weighted residuals, shape (k, 6), their derivatives, shape (k, 6, 7), and their columns, shape (k, 7), -1 for none.
+def bare_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
+    """Residuals of observed poses [m, rad], shape (k, 6), their derivatives, shape (k, 6, 7), and their columns, shape (k, 7), -1 for none.
 
     The seventh column is the shift of the camera's clock: later images were taken elsewhere.
     """
     priors = block.priors
-    count = len(priors)
-    white = whitening(priors.covariance) * np.sqrt(priors.weight)[:, None, None]
-    by = np.zeros((count, POSE, POSE + 1))
+    by = np.zeros((len(priors), POSE, POSE + 1))
     arm = np.einsum("kij,kj->ki", block.stations.mat_local_ins[priors.station], priors.arm_m)
     by[:, :3, :3], by[:, :3, 3:6], by[:, 3:, 3:6] = np.eye(3), -cross_matrix(arm), np.eye(3)
     by[:, :3, 6], by[:, 3:, 6] = -priors.velocity_m_s, -priors.turning_rad_s
     lead = block.stations.lead[priors.station]
     shift = unknowns.camera[lead, lenses.FREE + MOUNTING.index("timeshift")]
     columns = np.concatenate([unknowns.station[priors.station], shift[:, None]], axis=1)
-    residual = np.einsum("kij,kj->ki", white, pose_residuals(block, priors))
-    return residual, white @ by, columns
+    return pose_residuals(block, priors), by, columns
+
+
+def pose_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
+    """Rows of observed poses with independent errors of unit size: residuals, derivatives, columns.
+
+    Where errors last, a row is what is new against the pose before (a Markov process), whose seven columns follow.
+    """
+    priors = block.priors
+    residual, by, columns = bare_rows(block, unknowns)
+    white = whitening(priors.covariance) * np.sqrt(priors.weight)[:, None, None]
+    residual, by = np.einsum("kij,kj->ki", white, residual), white @ by
+    if priors.before is None or priors.keep is None:
+        return residual, by, columns
+    return what_is_new(priors.before, priors.keep, residual, by, columns)
+
+
+def what_is_new(before: Ints, keep: Array, residual: Array, by: Array, columns: Ints) -> tuple[Array, Array, Ints]:
+    """Rows of unit errors that are correlated with those before made independent."""
+    last = np.maximum(before, 0)
+    kept = np.repeat(keep, 3, axis=1) * (before >= 0)[:, None]
+    scale = 1.0 / np.sqrt(1.0 - kept**2)
+    new = scale * (residual - kept * residual[last])
+    both = np.concatenate([scale[:, :, None] * by, -(scale * kept)[:, :, None] * by[last]], axis=2)
+    return new, both, np.concatenate([columns, np.where((before >= 0)[:, None], columns[last], -1)], axis=1)
 
 
 def known_rows(block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns) -> tuple[Array, Array, Ints]:

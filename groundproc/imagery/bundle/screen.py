@@ -29,6 +29,8 @@ LEAST_CHANGE: Final = 1e-4
 """Rounds end where less than this part of the measurements comes or goes."""
 LEAST_ANGLE_RAD: Final = float(np.deg2rad(0.3))
 """Rays that meet under less do not make a point."""
+ROUGH: Final = 1e-6
+"""Part of the sum of squares at which steps end while weights still change."""
 MOST_SOFT: Final = 12
 SOFT_STEPS: Final = 5
 _NORMAL: Final = 1.1774
@@ -62,7 +64,9 @@ class Adjusted:
     sigma_px: float
 
 
-def adjust(block: Block, known: tuple[RigCamera, ...], matched: Mask, progress: Progress | None = None) -> Adjusted:
+def adjust(
+    block: Block, known: tuple[RigCamera, ...], matched: Mask, progress: Progress | None = None, begun: bool = False
+) -> Adjusted:
     """Adjust, find what is wrong, and adjust again.
 
     Parameters
@@ -73,18 +77,22 @@ def adjust(block: Block, known: tuple[RigCamera, ...], matched: Mask, progress: 
     matched : ndarray of bool, shape (n,)
         Measurements that the machine found; the others come from people.
     progress : callable, optional
+    begun : bool
+        Whether the block was adjusted before: what is wrong shows at once.
     """
-    block = _without_single(block)
-    factor = 1.0
-    if matched.any():
+    if begun:
+        block, _ = _screened(block, matched)
+    block, factor = _without_single(block), 1.0
+    if matched.any() and not begun:
         block = _led(block, known, matched, progress)
-    solved = solve(block, known, progress)
+    solved = solve(block, known, progress, settled_at=ROUGH)
     for _ in range(MOST_ROUNDS):
         block, changed = _screened(solved.block, matched)
         block = _weighed_priors(_without_single(block))
         if changed < LEAST_CHANGE * len(matched) and np.array_equal(block.priors.weight, solved.block.priors.weight):
             break
-        solved = solve(block, known, progress)
+        solved = solve(block, known, progress, settled_at=ROUGH)
+    solved = solve(solved.block, known, progress)
     if matched.any():
         solved, factor = _scaled(solved, matched, progress)
     found = cofactors(solved)

@@ -59,6 +59,7 @@ def solve(
     known: tuple[RigCamera, ...],
     progress: Callable[[int, float], None] | None = None,
     most_steps: int = MOST_STEPS,
+    settled_at: float = SETTLED,
 ) -> Solved:
     """Adjust a block.
 
@@ -70,7 +71,8 @@ def solve(
     progress : callable, optional
         Told the number of each step and the sum of squares.
     most_steps : int
-        Fewer where weights will change anyway.
+    settled_at : float
+        Part of the sum of squares: fewer steps and a larger part will do where weights change anyway.
 
     Raises
     ------
@@ -88,8 +90,8 @@ def solve(
         gained, block, now = now - after, trial, after
         if progress is not None:
             progress(number, now)
-        if gained <= SETTLED * max(now, 1e-12):
-            if undamped:
+        if gained <= settled_at * max(now, 1e-12):
+            if undamped or settled_at > SETTLED:
                 settled = True
                 break
             # what little damping there is holds the soft modes of a block: the bend of a strip costs next to nothing

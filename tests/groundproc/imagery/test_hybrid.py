@@ -9,7 +9,6 @@ from flightlog import frames
 from groundproc.estimation.surveyed import with_covariance
 from groundproc.flight.positions.poses import read_poses
 from groundproc.imagery.hybrid import Gained, information_gained, thinned, write_gained
-from groundproc.imagery.lasting import _factor
 
 
 @given(st.integers(0, 2**16))
@@ -48,13 +47,3 @@ def test_poses_are_read_by_the_door_of_the_smoother(tmp_path: Path) -> None:
     assert solution.quat_place_ins_wxyz is not None
     np.testing.assert_allclose(frames.mat_from_quat(solution.quat_place_ins_wxyz), mats, atol=1e-6)
     assert len(thinned(poses, 2.0).time_ns) == 3
-
-
-def test_errors_that_last_are_told_from_independent_ones() -> None:
-    rng = np.random.default_rng(4)
-    white = rng.normal(0, 1, (200, 3))
-    lasting = np.zeros_like(white)
-    for n in range(1, 200):
-        lasting[n] = 0.9 * lasting[n - 1] + white[n]
-    assert _factor(white) < 1.3
-    assert 10.0 < _factor(lasting) < 30.0  # (1 + 0.9) / (1 - 0.9) is 19
