@@ -166,7 +166,8 @@ def adjust_window(
         path = _laid_on(path, tie)
     mat, lever = sources.mat_ins_lidar, sources.lever_m
     bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
-    stretch = Stretch(path, motion.source, bias, whole=not before and not more)
+    unheld_m = None if track.restarts else np.array(track.unheld_m[first:last])
+    stretch = Stretch(path, motion.source, bias, not before and not more, unheld_m)
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart))
     if motion.source == LIDAR:

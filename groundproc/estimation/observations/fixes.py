@@ -9,12 +9,12 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.constants import NS_PER_S
-from groundproc.estimation.consensus import POSITION_TAU_S, POSITION_WHITE_M
+from groundproc.estimation.consensus import POSITION_TAU_S, POSITION_WHITE_M, Steps, agreeing, doubt
 from groundproc.estimation.method import Given
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, Stated, turned_by
 from groundproc.estimation.observations.moments import means, poses, seconds, spots, velocities, within
-from groundproc.estimation.observations.observation import Flown, Observation, Outcome, State
-from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, cross, eye, whitened
+from groundproc.estimation.observations.observation import Flown, Observation, Outcome, State, Stretch
+from groundproc.estimation.observations.rows import Errors, Factor, H, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.observations.source import Clock
 from groundproc.estimation.observations.states import (
     ATTITUDE,
@@ -26,6 +26,7 @@ from groundproc.estimation.observations.states import (
 )
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Positions
+from groundproc.estimation.odometry.tracker import SURE_HELD_M
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.sync.tracks import low_pass
 from groundproc.flight.timeline import Leg
@@ -49,8 +50,43 @@ LEAST_SPREAD: Final = 0.5
 """Fixes are not taken to agree better than this, in their sigmas: over seconds they all have the same error."""
 WRONG_SIGMAS: Final = 4.0
 """A path whose distance from the fixes is more, RMS, is worth a warning."""
+UNHELD_M2: Final = 1.0
+"""What a path may wander by in a slice [m^2] that does not hold it firmly: such a lidar judges nobody."""
+BEARING_RAD: Final = 0.05
+"""How far the odometry's map is turned (1 sigma): by the heading that it began with."""
+AGE_S: Final = 0.2
+"""How much older than stated a fix may be (1 sigma)."""
 SLID: Final = "position_drift"
 """Of the figures of a step: how far the path slides away from the fixes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """Fixes that were left out because they contradict the lidar.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+    farthest_m : float
+        Largest distance from where the others have the path.
+    doubt_m2 : ndarray, shape (3,)
+        Variance of where the whole lies, as far as nobody can tell which of them are right.
+    """
+
+    time_ns: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    farthest_m: float = 0.0
+    doubt_m2: Array = field(default_factory=lambda: np.zeros(3))
+
+    @classmethod
+    def of_all(cls, parts: Sequence["Left"]) -> "Left":
+        """Those of several windows."""
+        if not parts:
+            return cls()
+        return cls(
+            np.unique(np.concatenate([part.time_ns for part in parts])),
+            max(part.farthest_m for part in parts),
+            np.max([part.doubt_m2 for part in parts], axis=0),
+        )
 
 
 @dataclass(slots=True)
@@ -64,17 +100,36 @@ class Fixes(Observation):
     number : int
         Of the leg: each has a mean error of its own.
     clock : Clock
+    left : Left
+        What was left out.
     """
 
     name: str
     given: Positions
     number: int
     clock: Clock
+    left: "Left" = field(default_factory=lambda: Left())
+
+    def begin(self, stretch: Stretch) -> "Fixes":
+        """Without those that go where the lidar does not, while it holds the path."""
+        given, left = without_walks(self.given, stretch)
+        return replace(self, given=given, left=left)
+
+    def keep(self, state: State, frame: Path) -> "Left":
+        """What was left out."""
+        del state, frame
+        return self.left
+
+    def tell(self, state: State) -> "Left":
+        """What was left out."""
+        del state
+        return self.left
 
     def joined(self, values: Mapping[str, Array], kept: Sequence[Any]) -> "Fixes":
-        """With the delay as the windows found it."""
-        del kept
-        return replace(self, clock=self.clock.held(values))
+        """With the delay as the windows found it, and without what they left out."""
+        left = Left.of_all([each for each in kept if each is not None])
+        given = self.given.only(~np.isin(self.given.time_ns, left.time_ns))
+        return replace(self, clock=self.clock.held(values), given=given, left=left)
 
     def unknowns(self, unknowns: Unknowns) -> None:
         """The mean error, and the delay where it is free."""
@@ -83,7 +138,7 @@ class Fixes(Observation):
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """The course of the positions, and their mean."""
-        return position_factors(self.given, state.path, unknowns, self.number, self.clock)
+        return position_factors(self.given, state.path, unknowns, self.number, self.clock, self.left.doubt_m2)
 
     def take(self, part: Mapping[str, Array], path: Path) -> None:
         """The mean error is told anew in each step."""
@@ -97,6 +152,11 @@ class Fixes(Observation):
     def warnings(self, outcome: Outcome) -> list[str]:
         """A path that goes where the fixes do not."""
         found = []
+        left = Left.of_all([told[self.name] for told in outcome.told if self.name in told])
+        if len(left.time_ns):
+            found.append(
+                f"{len(left.time_ns)} GNSS positions left out: the lidar holds the path, and they leave it by up to {left.farthest_m:.1f} m"
+            )
         slid = outcome.largest(SLID)
         if slid > SLID_SIGMAS:
             found.append(
@@ -123,6 +183,35 @@ def of_run(flown: Flown) -> list[Observation]:
     ]
 
 
+def without_walks(given: Positions, stretch: Stretch) -> tuple[Positions, Left]:
+    """Positions without those that walk away from a path that the lidar holds, and what was left out.
+
+    A receiver that is led astray by walls and trees goes by metres where the lidar sees that nothing moves. The longest chain of fixes
+    that the lidar's way explains is right (`consensus`).
+    """
+    inside = within(given.time_ns, stretch.path)
+    if stretch.unheld_m is None or inside.sum() < 2:
+        return given, Left()
+    time_ns = given.time_ns[inside]
+    _, _, step, share = spots(time_ns, stretch.path)
+    quat, position = poses(stretch.path, step, share)
+    place = position + frames.mat_from_quat(quat) @ given.lever_m
+    off = given.position_m[inside] - place
+    gained = np.where(stretch.unheld_m <= SURE_HELD_M, np.square(stretch.unheld_m), UNHELD_M2)
+    edges_s = np.arange(len(gained) + 1) * H
+    time_s: Array = np.asarray((time_ns - stretch.path.start_ns) * 1e-9, np.float64)
+    drift_m2 = np.interp(time_s, edges_s, np.concatenate([[0.0], np.cumsum(gained)]))
+    loose = np.column_stack([BEARING_RAD * place[:, :2], AGE_S * velocities(stretch.path, step, given.lever_m)])
+    steps = Steps(given.sigma_m[inside], given.tau_s, drift_m2, loose)
+    kept = agreeing(time_s, off, steps)
+    if kept.all():
+        return given, Left()
+    left = time_ns[~kept]
+    right = np.stack([np.interp(time_s[~kept], time_s[kept], axis) for axis in off[kept].T], axis=1)
+    farthest_m = float(np.linalg.norm(off[~kept] - right, axis=1).max())
+    return given.only(~np.isin(given.time_ns, left)), Left(left, farthest_m, doubt(time_s, off, kept))
+
+
 def drift(factors: Sequence[Factor]) -> float:
     """Largest mean of ten whitened position residuals on end, in sigmas of such a mean: a path that slides away from the fixes."""
     largest = 0.0
@@ -140,8 +229,9 @@ def fixes_name(number: int) -> str:
 
 
 def position_factors(
-    given: Positions, path: Path, unknowns: Unknowns, number: int = 0, clock: Clock | None = None
-) -> list[Factor]:
+    given: Positions, path: Path, unknowns: Unknowns, number: int = 0, clock: Clock | None = None,
+    doubt_m2: Array | float = 0.0,
+) -> list[Factor]:  # fmt: skip
     """Positions in means of a second: their course, and their mean; none where the path covers fewer than two.
 
     The course alone, with an unknown mean error, bends and turns the path. Where the whole lies is left to the plain mean of the fixes,
@@ -174,7 +264,8 @@ def position_factors(
     course = replace(course, sigma=course.sigma / np.sqrt(huber(np.abs(course.residual) / course.sigma, STEP_SIGMAS)))
     if fixes_name(number) not in unknowns.names:
         return [course]
-    return [course, _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)]
+    mean = _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)
+    return [course, replace(mean, sigma=np.sqrt(mean.sigma**2 + doubt_m2))]
 
 
 SAMPLES: Final = 8

@@ -62,12 +62,15 @@ class Stretch:
         Of that gyro, as the odometry has it.
     whole : bool
         The window is the whole flight: nothing is joined afterwards.
+    unheld_m : ndarray, shape (slices,), optional
+        How well each slice of the lidar holds the path, in the direction that it tells least of; none where it has led astray.
     """
 
     path: Path
     carried_by: str
     bias_rad_s: Array
     whole: bool
+    unheld_m: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

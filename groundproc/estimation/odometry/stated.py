@@ -1,7 +1,7 @@
 """What the autopilot states of the path, in the local frame: positions and attitudes, whose errors last."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
@@ -34,6 +34,12 @@ class Positions:
     lever_m: Array
     tau_s: Array
     white_m: float
+
+    def only(self, chosen: npt.NDArray[np.bool_]) -> "Positions":
+        """Some of them, by a mask of shape (n,)."""
+        return replace(
+            self, time_ns=self.time_ns[chosen], position_m=self.position_m[chosen], sigma_m=self.sigma_m[chosen]
+        )
 
 
 @dataclass(slots=True)

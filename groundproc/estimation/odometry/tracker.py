@@ -29,13 +29,15 @@ WIDE_AT_M: Final = (28.0, 60.0)
 LOST_M: Final = 15.0
 LOST_SIGMAS: Final = 6.0
 LOST_FIXES: Final = 8
-"""So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew."""
+"""So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew, unless the lidar holds it."""
 CHECKED: Final = 10
 """Slices over which the way is compared with a guide's: a second."""
 ASTRAY_M: Final = 1.5
 """What it may differ by; a smoother's velocity is right to 0.1 to 0.3 m/s."""
 SURE_HELD_M: Final = 0.03
 """A way that slices tell better than this is the lidar's to tell."""
+HELD_SHARE: Final = 0.98
+"""Of the slices that have to tell so much, for a path to be held."""
 FIX_TAU_S: Final = 1.0
 """The filter takes positions as if their errors lasted so long: light beside the lidar, and firm enough to hold it where there is none."""
 RECENT_S: Final = 0.5
@@ -79,7 +81,7 @@ class Tracker:
         self._bias, self._stated, self.keep = gyro_bias, stated, keep
         self.odometry: Odometry | None = None
         self.track: Track | None = None
-        self._far, self._next_attitude_ns = 0, 0
+        self._far, self._near, self._next_attitude_ns = 0, 0, 0
         self._range_m, self._guide, self._checked = 0.0, guide, 0
         self._bearing = Bearing(np.zeros(3))
         self._history, self._begin_ns = History(), 0
@@ -114,6 +116,7 @@ class Tracker:
         if self.odometry is not None and self.track is not None:
             self.odometry.number -= slices
             self.track.first -= slices
+            self._near -= slices
 
     def _begin(self, piece: Slice) -> bool:
         state = self._state_at(piece.number)
@@ -132,7 +135,7 @@ class Tracker:
         self._bearing = Bearing(state.position_m.copy())
         self._history.clear()
         self._history.add(self._begin_ns, state.position_m.copy(), state.quat.copy())
-        self._far = 0
+        self._far, self._near = 0, number
 
     def _follow_range(self, odometry: Odometry, piece: Slice) -> None:
         """Wider voxels as the ranges grow, and narrower ones again; what the map holds is taken along."""
@@ -213,13 +216,22 @@ class Tracker:
             way, place = was.position_m, fix.position_m - was.mat_map_sensor @ self._stated.lever_m
         off = self._bearing.on_map(way, place, float(fix.sigma_m[:2].mean())) - way
         self.track.fixes += 1
-        self._far = self._far + 1 if (np.abs(off) > np.maximum(LOST_M, LOST_SIGMAS * fix.sigma_m)).any() else 0
+        if not (np.abs(off) > np.maximum(LOST_M, LOST_SIGMAS * fix.sigma_m)).any():
+            self._far, self._near = 0, odometry.number
+        else:
+            self._far += 1
         sigma_m = fix.sigma_m * np.sqrt(max(2.0 * FIX_TAU_S * fix.rate_hz, 1.0))
         before = state.position_m.copy()
         odometry.position_fix(before + off, sigma_m)
         self._history.shift(state.position_m - before)
-        if self._far >= LOST_FIXES:
+        if self._far >= LOST_FIXES and not self._is_held(odometry):
             self._restart(odometry)
+
+    def _is_held(self, odometry: Odometry) -> bool:
+        """Whether the lidar has held the path firmly since the last fix that lay near it: then it is the fixes that went away."""
+        assert self.track is not None
+        since = np.array(self.track.unheld_m[-max(odometry.number - self._near, 1) :])
+        return len(since) > 0 and float((since <= SURE_HELD_M).mean()) >= HELD_SHARE
 
     def _restart(self, odometry: Odometry, astray: bool = False) -> None:
         """The odometry has lost its way: begin anew from a rough pose, with a new map; `astray`: a guide told."""

@@ -172,3 +172,28 @@ def test_what_seems_to_hold_the_path_and_leads_it_elsewhere_is_noticed_in_a_seco
         tracker.feed(Slice(number, np.empty(0, np.int64), np.empty((0, 3), np.float32)))
     assert tracker.track is not None
     assert (tracker.track.astray, tracker.track.restarts) == (astray, astray)
+
+
+class Astray(Late):
+    """Positions that are 4 km off, too far to be followed at once, from the tenth second on."""
+
+    def fixes(self, now_ns: int) -> Sequence[Fix]:
+        off = np.array([4000.0, 0.0, 0.0])
+        return [
+            replace(fix, position_m=fix.position_m + off) if fix.time_ns > START_NS + 10 * 10**9 else fix
+            for fix in super().fixes(now_ns)
+        ]
+
+
+@pytest.mark.parametrize(("unheld_m", "begun_anew"), [(0.01, False), (0.1, True), (np.inf, True)])
+def test_fixes_that_go_away_from_a_path_that_the_lidar_holds_do_not_make_it_begin_anew(
+    unheld_m: float, begun_anew: bool
+) -> None:
+    motion, rough = straight()
+    tracker = Tracker(motion, rough, np.eye(3), np.zeros(3), np.zeros(3), Astray(0), keep=False)
+    for number in range(130):
+        tracker.feed(Slice(number, np.empty(0, np.int64), np.empty((0, 3), np.float32)))
+        assert tracker.track is not None
+        tracker.track.unheld_m[-1] = unheld_m
+    assert tracker.track is not None
+    assert (tracker.track.restarts > 0) == begun_anew
