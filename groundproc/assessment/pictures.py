@@ -12,6 +12,7 @@ Array = npt.NDArray[np.float64]
 
 _NAMED: Final = 40
 """Points beyond which their names would hide them."""
+_DOTS: Final = 40_000
 _ARROW: Final = 0.12
 """Length of the usual arrow in the width of the map."""
 
@@ -43,6 +44,47 @@ def residuals(path: Path, ids: list[str], place_m: Array, d_m: Array, title: str
     _map(figure, figure.add_subplot(grid[:, 0]), ids, place_m, d_m)
     for axis, name in enumerate(("dx", "dy", "dz")):
         _histogram(figure.add_subplot(grid[axis, 1]), d_m[:, axis], name)
+    figure.suptitle(title, fontsize=10)
+    figure.tight_layout()
+    with written_aside(path) as aside:
+        figure.savefig(aside, format="png", dpi=110)
+    plt.close(figure)
+
+
+def distances(path: Path, shown: list[tuple[str, Array, Array]], title: str) -> None:
+    """Maps of distances by colour, side by side on one scale, and how they are spread.
+
+    Parameters
+    ----------
+    path : Path
+        PNG.
+    shown : list of (str, ndarray, ndarray)
+        Name, places, shape (n, 3), and distances, shape (n,) [m].
+    title : str
+    """
+    plt = _plt()
+    figure, axes = plt.subplots(1, len(shown) + 1, figsize=(5.5 * (len(shown) + 1), 5.2))
+    every = np.concatenate([np.abs(d_m) for _, _, d_m in shown])
+    most = 1e3 * max(float(np.percentile(every, 95)) if len(every) else 0.01, 1e-3)
+    for map_axes, (name, place_m, d_m) in zip(axes, shown, strict=False):
+        some = slice(None, None, max(len(d_m) // _DOTS, 1))
+        origin = np.floor(place_m.min(axis=0)) if len(place_m) else np.zeros(3)
+        x, y = (place_m[some, :2] - origin[:2]).T
+        drawn = map_axes.scatter(x, y, c=1e3 * d_m[some], s=4, cmap="coolwarm", vmin=-most, vmax=most, rasterized=True)
+        figure.colorbar(drawn, ax=map_axes, label="difference [mm]", shrink=0.8)
+        map_axes.set(title=name, xlabel=f"east - {origin[0]:.0f} [m]", ylabel=f"north - {origin[1]:.0f} [m]")
+        map_axes.set_aspect("equal", adjustable="datalim")
+        if not len(d_m):
+            continue
+        label = (
+            f"{name} median {1e3 * np.median(d_m):+.1f}, RMS {1e3 * np.sqrt(np.mean(d_m**2)):.1f} mm, n = {len(d_m):,}"
+        )
+        axes[-1].hist(
+            np.clip(1e3 * d_m, -1.5 * most, 1.5 * most), bins=60, alpha=0.6, density=True, label=label.strip()
+        )
+    axes[-1].axvline(0.0, color="k", lw=0.8)
+    axes[-1].set(xlabel="difference [mm]", yticks=[])
+    axes[-1].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.12))
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
     with written_aside(path) as aside:

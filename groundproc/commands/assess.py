@@ -2,14 +2,16 @@
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from groundproc.assessment.targets import Wanted
 
+Progress = Callable[[str, int], None]
 HELP = "hold a cloud against surveyed points, or two sets of coordinates against each other"
-USAGE = "expected swath assess CLOUD --points CSV [--mode MODE], or swath assess --pairs CSV"
+USAGE = "expected swath assess CLOUD --points CSV [--mode MODE], CLOUD --reference CLOUD, CLOUD --strips, or swath assess --pairs CSV"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +44,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CSV",
         help="two sets of coordinates by id: columns id, then x, y, z of each, reference first",
     )
+    parser.add_argument(
+        "--reference", type=Path, metavar="CLOUD", help="another cloud of the same place, which is taken for the truth"
+    )
+    parser.add_argument("--register", action="store_true", help="with --reference: lay the cloud on it first")
+    parser.add_argument(
+        "--strips",
+        action="store_true",
+        help="how well strips agree: thickness of planes within them, differences between",
+    )
+    parser.add_argument(
+        "--before", type=Path, metavar="CLOUD", help="with --strips: the same cloud before it was adjusted, beside it"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     parser.add_argument(
         "--picture", type=Path, metavar="PNG", help="draw the differences: a map, and how they are spread"
@@ -51,37 +65,94 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare, and print a table."""
-    from flightlog.errors import UsageError
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file, write_json
 
-    given = bool(arguments.cloud), bool(arguments.points), bool(arguments.pairs)
-    apart = arguments.mode or arguments.target or arguments.target_size
-    if given not in ((True, True, False), (False, False, True)) or (arguments.pairs and apart):
-        raise UsageError(USAGE)
+    given = [name for name in ("points", "pairs", "reference", "strips") if getattr(arguments, name)]
+    _agree(arguments, given)
     wanted = _wanted(arguments)
-    expect([arguments.cloud], CLOUD, CLOUD_WORDS)
+    expect([arguments.cloud, arguments.reference, arguments.before], CLOUD, CLOUD_WORDS)
     for path, suffix in ((arguments.json, ".json"), (arguments.picture, ".png")):
         if path is not None:
             claim_file(path, (suffix,), arguments.force)
 
     from tqdm import tqdm
 
+    with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
+
+        def advance(stage: str, count: int) -> None:
+            bar.set_description(stage, refresh=False)
+            bar.update(count)
+
+        told, text = {"reference": _reference, "strips": _strips}.get(given[0], _points)(arguments, wanted, advance)
+    if arguments.json is not None:
+        write_json(arguments.json, told)
+    print(text)
+    return 0
+
+
+def _agree(arguments: argparse.Namespace, given: list[str]) -> None:
+    """See that what is given goes together.
+
+    Raises
+    ------
+    UsageError
+        It does not.
+    """
+    from flightlog.errors import UsageError
+
+    if len(given) != 1 or bool(arguments.cloud) == (given == ["pairs"]):
+        raise UsageError(USAGE)
+    apart = {"mode": "points", "target": "points", "target_size": "points", "register": "reference", "before": "strips"}
+    for name, needs in apart.items():
+        if getattr(arguments, name) and given != [needs]:
+            raise UsageError(f"--{name.replace('_', '-')}: belongs to --{needs}; {USAGE}")
+
+
+def _points(arguments: argparse.Namespace, wanted: "Wanted", advance: Progress) -> tuple[dict[str, Any], str]:
+    """Against surveyed points, or a table of pairs."""
     from groundproc.assessment import pictures, work
 
     if arguments.pairs:
         found = work.of_pairs(arguments.pairs)
     else:
         task = work.PointsTask(arguments.cloud, arguments.points, arguments.mode, wanted)
-        with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
-            found = work.of_cloud(task, bar.update)
+        found = work.of_cloud(task, lambda count: advance("points", count))
     if arguments.picture is not None:
         against = arguments.pairs or f"{arguments.cloud.name} against {arguments.points.name}"
         pictures.residuals(arguments.picture, found.ids, found.place_m, found.d_m, str(against))
-    if arguments.json is not None:
-        write_json(arguments.json, found.told)
-    print(found.text)
-    return 0
+    return found.told, found.text
+
+
+def _reference(arguments: argparse.Namespace, wanted: "Wanted", advance: Progress) -> tuple[dict[str, Any], str]:
+    """Against another cloud."""
+    from groundproc.analysis import reference
+    from groundproc.assessment import pictures
+
+    found = reference.compare(reference.Task(arguments.cloud, arguments.reference, arguments.register), advance)
+    if arguments.picture is not None:
+        title = f"{arguments.cloud.name} less {arguments.reference.name}"
+        pictures.distances(arguments.picture, [("", found.place_m, found.distance_m)], title)
+    return found.told, reference.text(found.told)
+
+
+def _strips(arguments: argparse.Namespace, wanted: "Wanted", advance: Progress) -> tuple[dict[str, Any], str]:
+    """Strips against each other."""
+    from groundproc.assessment import pictures
+    from groundproc.strips import precision
+
+    voxel_m, before = None, None
+    if arguments.before is not None:
+        before = precision.of_cloud(arguments.before, None, advance)
+        voxel_m = before.told["voxel_m"]
+    found = precision.of_cloud(arguments.cloud, voxel_m, advance)
+    if arguments.picture is not None:
+        both = [("before", before)] * (before is not None) + [("after" if before is not None else "", found)]
+        shown = [(name, each.differences.place_m, each.differences.along_m) for name, each in both if each is not None]
+        pictures.distances(arguments.picture, shown, f"{arguments.cloud.name}: later strip less earlier one")
+    if before is None:
+        return found.told, precision.text(found.told)
+    return found.told | {"before": before.told}, precision.text(found.told, before.told)
 
 
 def _wanted(arguments: argparse.Namespace) -> "Wanted":

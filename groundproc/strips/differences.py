@@ -45,9 +45,13 @@ class Patches:
         none = np.broadcast_to(np.float64(0.0), (len(of), 4))
         self._cells.add(np.zeros(len(of), np.int64), xyz, none[:, :3], none, of, of.astype(np.int64))
 
+    def cells(self) -> npt.NDArray[np.void]:
+        """Points by voxel and strip, as `clusters.CLUSTER`; places are half an edge more than they were given."""
+        return self._cells.clusters()
+
     def differences(self) -> "Differences":
         """Differences of all pairs of strips."""
-        cells = self._cells.clusters()
+        cells = self.cells()
         index = np.floor(cells["place"] / self.voxel_m).astype(np.int64)
         order = np.lexsort((cells["strip"], index[:, 2], index[:, 1], index[:, 0]))
         cells, index = cells[order], index[order]

@@ -37,7 +37,15 @@ _SAME, _GAINED, _LOST, _UNSEEN = range(4)
 _MILLIMETRE: Final = 1e-3
 """Coordinates are stored to this: a scatter of none is not known better."""
 _RECORD: Final = np.dtype(
-    [("xyz", "f8", (3,)), ("area", "f4"), ("distance", "f4"), ("own", "f4"), ("shared", "f4"), ("seen", "?")]
+    [
+        ("xyz", "f8", (3,)),
+        ("normal", "f4", (3,)),
+        ("area", "f4"),
+        ("distance", "f4"),
+        ("own", "f4"),
+        ("shared", "f4"),
+        ("seen", "?"),
+    ]
 )
 
 
@@ -91,8 +99,7 @@ def compare(task: Task, epochs: Epochs, folder: Path, progress: Progress) -> dic
     UsageError
         Ground is asked for that a cloud does not tell.
     """
-    radius = task.radius_m or float(np.clip(np.sqrt(_POINTS / (np.pi * epochs.per_m2)), _LEAST_M, _MOST_M))
-    shape = _Shape(radius, task.reach_m, task.spacing_m or 2.0 * radius)
+    shape = _shape(task, epochs)
     with tempfile.TemporaryFile(dir=folder) as file:
         count = 0
         for some in _measured(task, epochs, shape, folder, progress):
@@ -105,6 +112,26 @@ def compare(task: Task, epochs: Epochs, folder: Path, progress: Progress) -> dic
         file.flush()
         records = np.memmap(file, _RECORD, "r+", shape=(count,))
         return _finish(task, epochs, shape, records, folder)
+
+
+def _shape(task: Task, epochs: Epochs) -> _Shape:
+    radius = task.radius_m or float(np.clip(np.sqrt(_POINTS / (np.pi * epochs.per_m2)), _LEAST_M, _MOST_M))
+    return _Shape(radius, task.reach_m, task.spacing_m or 2.0 * radius)
+
+
+def distances(task: Task, epochs: Epochs, folder: Path, progress: Progress) -> npt.NDArray[np.void]:
+    """Distances at all core points: fields xyz, normal, distance, own and shared (variances), and seen.
+
+    Parameters
+    ----------
+    task : Task
+    epochs : Epochs
+    folder : Path
+        For a temporary file.
+    progress : callable
+    """
+    parts = list(_measured(task, epochs, _shape(task, epochs), folder, progress))
+    return np.concatenate(parts) if parts else np.empty(0, _RECORD)
 
 
 def _measured(
@@ -159,6 +186,7 @@ def _records(
     found = m3c2.distances(xyz - origin, normal, bins, shape.radius_m, shape.reach_m)
     records = np.empty(len(xyz), _RECORD)
     records["xyz"], records["area"], records["seen"] = xyz, area, found.seen
+    records["normal"] = normal
     records["distance"] = found.distance_m
     records["own"] = np.maximum(found.own_m2, _MILLIMETRE**2)
     if epochs.registered:
