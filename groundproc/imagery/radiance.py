@@ -26,6 +26,8 @@ _EXPOSURE_S: Final = 33434
 _F_NUMBER: Final = 33437
 _ISO: Final = 34855
 _LEAST_LIGHT: Final = 0.05
+TEMPERATURE: Final = "temperature"
+"""The band of a thermal camera, whose numbers follow what it sees by a scale and an offset."""
 TRANSFERS: Final = ("linear", "srgb")
 
 
@@ -88,9 +90,41 @@ def light(path: Path, camera: RigCamera) -> npt.NDArray[np.float32]:
         black = camera.black_level or 0.0
     transfer, unmix = response_of(camera)
     if transfer == "srgb":
-        numbers = np.where(numbers <= 0.04045, numbers / 12.92, ((numbers + 0.055) / 1.055) ** 2.4).astype(np.float32)
+        numbers = _straight(numbers)
     numbers = (numbers - np.float32(black)) / vignetting(camera)[..., None] / np.float32(exposure(path))
     return numbers if unmix is None else np.asarray(numbers @ unmix.T.astype(np.float32))
+
+
+def evened(shown: npt.NDArray[Any], camera: RigCamera) -> npt.NDArray[Any]:
+    """A picture, shape (height, width, planes), without the fall of light to its corners; of the same type, full scale at most.
+
+    Raises
+    ------
+    UsageError
+        The rig's response or vignetting is not what it should be.
+    """
+    if camera.vignetting is None or TEMPERATURE in camera.bands:
+        return shown
+    fall = vignetting(camera)[..., None]
+    if not np.issubdtype(shown.dtype, np.integer):
+        return np.asarray(shown / fall, shown.dtype)
+    most, black = float(np.iinfo(shown.dtype).max), camera.black_level or 0.0
+    numbers = shown.astype(np.float32)
+    curved = response_of(camera)[0] == "srgb"
+    numbers = _encoded(_straight(numbers / most) / fall) * most if curved else (numbers - black) / fall + black
+    return np.clip(np.rint(numbers), 0.0, most).astype(shown.dtype)
+
+
+def _straight(numbers: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Light of numbers of 0 to 1 that follow it by the sRGB curve."""
+    return np.where(numbers <= 0.04045, numbers / 12.92, ((numbers + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _encoded(light: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """The other way round."""
+    return np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 0.0) ** (1 / 2.4) - 0.055).astype(
+        np.float32
+    )
 
 
 def response_of(camera: RigCamera) -> tuple[str, Array | None]:
@@ -165,13 +199,7 @@ def _of_powers(given: Mapping[str, Any], shape: tuple[int, int]) -> npt.NDArray[
 
 def exposure(path: Path) -> float:
     """Exposure time [s] x ISO / 100 / f-number^2 as EXIF has them; 1 for what it does not say."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as file:
-            found = file.getexif().get_ifd(_EXIF)
-    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError):
-        return 1.0
+    found = _exif(path)
 
     def number(tag: int, otherwise: float) -> float:
         value = found.get(tag, otherwise)
@@ -182,6 +210,22 @@ def exposure(path: Path) -> float:
         return value if np.isfinite(value) and value > 0.0 else otherwise
 
     return number(_EXPOSURE_S, 1.0) * number(_ISO, 100.0) / 100.0 / number(_F_NUMBER, 1.0) ** 2
+
+
+def states_exposure(path: Path) -> bool:
+    """Whether a picture says how long it was exposed."""
+    return _EXPOSURE_S in _exif(path)
+
+
+def _exif(path: Path) -> Mapping[int, Any]:
+    """The tags about the exposure; none where they cannot be read."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as file:
+            return file.getexif().get_ifd(_EXIF)
+    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError):
+        return {}
 
 
 def read_panels(path: Path, bands: Sequence[str]) -> list[Panel]:

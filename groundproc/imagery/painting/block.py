@@ -14,7 +14,7 @@ from flightlog.errors import CaptureError, UsageError
 from groundproc.imagery import pictures
 from groundproc.imagery.camera import Camera
 from groundproc.imagery.painting.visibility import Eye
-from groundproc.imagery.poses import read_poses
+from groundproc.imagery.poses import NO_TIME, ImagePoses, read_poses
 from groundproc.imagery.rig import Rig, RigCamera, read_rig
 from groundproc.imagery.site import Site, cartesian, georeferenced
 
@@ -24,6 +24,10 @@ POSES: Final = "poses.csv"
 RIG: Final = "rig.yaml"
 COLOURS: Final = ("red", "green", "blue")
 """What the planes of a picture of three are, where the rig does not say."""
+_STRIP_S: Final = 10.0
+"""Images of one strip follow each other sooner; beyond lies a turn."""
+_EVEN: Final = 3.0
+"""Where one neighbour in time is so much farther than the other, it tells less than nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +124,11 @@ def load(folder: Path, photos: Path | None, crs: pyproj.CRS | None, cloud: Path)
     place_m = site.local(poses.place_m)
     mat_local_cam = site.mat_local_grid(place_m) @ poses.mat_grid_camera()
     roots = [photos] if photos is not None else [folder, *_found_before(folder)]
-    left_out: list[str] = []
+    of_camera = np.array(
+        [which if (which := rig.camera_of(name)) is not None else -1 for name in poses.images], np.int64
+    )
+    moves, unknown = _rolling(rig, of_camera, poses, place_m)
+    left_out: list[str] = [*unknown]
     layers: dict[tuple[tuple[str, ...], np.dtype[Any]], list[Image]] = {}
     for number, name in enumerate(poses.images):
         try:
@@ -129,7 +137,7 @@ def load(folder: Path, photos: Path | None, crs: pyproj.CRS | None, cloud: Path)
             left_out.append(str(error))
             continue
         camera = rig.cameras[which]
-        image = Image(name, path, which, eye_of(camera.camera, mat_local_cam[number], place_m[number]))
+        image = Image(name, path, which, eye_of(camera.camera, mat_local_cam[number], place_m[number], moves[number]))
         layers.setdefault((_bands(camera, size.planes, path), size.dtype), []).append(image)
     if not layers:
         reason = left_out[0] if left_out else "there are none"
@@ -138,10 +146,57 @@ def load(folder: Path, photos: Path | None, crs: pyproj.CRS | None, cloud: Path)
     return Block(rig, site, found, tuple(left_out))
 
 
-def eye_of(camera: Camera, mat_local_cam: Array, place_m: Array) -> Eye:
-    """A camera at a place, for the kernels."""
+def eye_of(camera: Camera, mat_local_cam: Array, place_m: Array, row_m: Array | None = None) -> Eye:
+    """A camera at a place, for the kernels; with a rolling shutter it moves from row to row."""
     size = np.array([camera.width_px, camera.height_px], np.int64)
-    return Eye(camera.kind, camera.lens(), np.ascontiguousarray(mat_local_cam.T), np.ascontiguousarray(place_m), size)
+    moves = np.zeros(3) if row_m is None else np.ascontiguousarray(row_m)
+    mat = np.ascontiguousarray(mat_local_cam.T)
+    return Eye(camera.kind, camera.lens(), mat, np.ascontiguousarray(place_m), size, moves)
+
+
+def velocities(utc_ns: npt.NDArray[np.int64], place_m: Array) -> Array:
+    """Velocity at places with times, shape (n, 3), by those before and after, by one of them where the other is far [m/s].
+
+    Not a number where no other is within `_STRIP_S`.
+    """
+    found = np.full((len(utc_ns), 3), np.nan)
+    order = np.argsort(utc_ns, kind="stable")
+    time_s = (utc_ns[order] - utc_ns[order[0]]) * 1e-9 if len(order) else np.empty(0)
+    place = place_m[order]
+    for n in range(len(order)):
+        before, after = n - 1 if n else None, n + 1 if n + 1 < len(order) else None
+        slopes, gaps = [], []
+        for other in (before, after):
+            gap = abs(time_s[other] - time_s[n]) if other is not None else np.inf
+            if other is not None and 0.0 < gap <= _STRIP_S:
+                slopes.append((place[other] - place[n]) / (time_s[other] - time_s[n]))
+                gaps.append(gap)
+        if len(gaps) == 2 and max(gaps) > _EVEN * min(gaps):
+            slopes, gaps = [slopes[int(np.argmin(gaps))]], [1.0]  # the other one is beyond a turn
+        if gaps:
+            share = np.array(gaps[::-1]) / sum(gaps)
+            found[order[n]] = share @ np.array(slopes)
+    return found
+
+
+def _rolling(
+    rig: Rig, cameras: npt.NDArray[np.int64], poses: ImagePoses, place_m: Array
+) -> tuple[Array, tuple[str, ...]]:
+    """How images move from row to row, shape (n, 3), 0 of those without a rolling shutter; and cameras of which nobody knows."""
+    moves, unknown = np.zeros((len(poses), 3)), []
+    for number, camera in enumerate(rig.cameras):
+        own = np.flatnonzero(cameras == number)
+        if not camera.line_delay_s or not len(own):
+            continue
+        timed = own[poses.utc_ns[own] != NO_TIME]
+        moves[timed] = velocities(poses.utc_ns[timed], place_m[timed]) * camera.line_delay_s
+        lost = len(own) - np.count_nonzero(np.isfinite(moves[own]).all(axis=1)) + len(own) - len(timed)
+        if lost:
+            unknown.append(
+                f"rolling shutter of camera {camera.name}: how fast {lost} of {len(own)} images moved is not known, as {POSES} "
+                "has no times of theirs or of those next to them; their rows are taken to be of one moment"
+            )
+    return np.nan_to_num(moves), tuple(unknown)
 
 
 def half_angle_rad(camera: Camera) -> float:

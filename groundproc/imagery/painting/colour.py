@@ -22,12 +22,14 @@ from groundproc.imagery.painting.paint import paint, part, room
 from groundproc.imagery.painting.scene import Scene, mapped
 from groundproc.imagery.painting.score import Score, score, worst
 from groundproc.imagery.painting.views import Views, blend
+from groundproc.imagery.radiance import TEMPERATURE
 
 Progress = Callable[[str, int], object]
 Array = npt.NDArray[np.float64]
 
 VIEWS: Final = "views"
-TEMPERATURE: Final = "temperature"
+_DIFFER_K: Final = 1.0
+"""What thermal images of one place differ by anyway."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +193,12 @@ def _columns(
 ) -> dict[str, npt.NDArray[Any]]:
     """The attributes that a layer gives, in the order of the file."""
     found = {band: mapped(folder / band, dimension(band).column, (scene.size,)) for band in layer.bands}
+    differ = None
+    if TEMPERATURE in layer.bands:
+        scale, _ = response_of(block.rig.cameras[layer.images[0].camera].response)
+        differ = _DIFFER_K / abs(scale or 1.0)
     for square in scene.squares:
-        values = blend(part(views, square.points), factor, layer.full, least)
+        values = blend(part(views, square.points), factor, layer.full, least, differ)
         for plane, band in enumerate(layer.bands):
             found[band][scene.number[square.points]] = _scaled(block, layer, band, values[:, plane])
     return found

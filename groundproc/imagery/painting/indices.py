@@ -13,13 +13,14 @@ from flightlog.errors import UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
+from groundproc.imagery.painting.balance import gains
 from groundproc.imagery.painting.block import Block, Image, Layer
 from groundproc.imagery.painting.mosaic import Mosaic, mosaic
 from groundproc.imagery.painting.ortho import Ground, balanced, ground
 from groundproc.imagery.painting.paint import paint, part, room
 from groundproc.imagery.painting.scene import mapped
-from groundproc.imagery.painting.views import blend
-from groundproc.imagery.radiance import Line, Panel, light, line, read_panels
+from groundproc.imagery.painting.views import NOBODY, blend
+from groundproc.imagery.radiance import Line, Panel, light, line, read_panels, states_exposure
 from groundproc.raster import geotiff
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Window
@@ -35,6 +36,8 @@ INDICES: Final = {
     "bndvi": ("nir", "blue"),
 }
 """Difference over sum of which bands."""
+_BRIGHTEST: Final = 99.9
+"""Percentile of light that counts as the full scale where exposures are compared."""
 _FEWEST: Final = 4
 """Pixels of a panel."""
 
@@ -104,10 +107,10 @@ class _Source:
     layer: Layer
     mosaic: Mosaic
     plane: int
+    factor: npt.NDArray[np.float32]
 
     def window(self, window: Window) -> Raster:
-        ones = np.ones((len(self.layer.images), len(self.layer.bands)), np.float32)
-        return balanced(self.mosaic, ones, window)[..., self.plane]
+        return balanced(self.mosaic, self.factor, window)[..., self.plane]
 
 
 def indices(task: Task, progress: Progress) -> Made:
@@ -134,7 +137,16 @@ def indices(task: Task, progress: Progress) -> Made:
         found = np.concatenate([each[np.isfinite(each)] for each in values])
         failed = tuple(dict.fromkeys(name for source in sources.values() for name in source.mosaic.failed))
         if task.draped is not None:
-            _drape(task, place, {band: sources[band].layer for band in (upper, lower)}, lines, progress)
+            _drape(task, place, sources, lines, progress)
+        untimed = [
+            ", ".join(each.bands)
+            for each in {id(s.layer): s.layer for s in sources.values()}.values()
+            if not _timed(each)
+        ]
+        warnings += tuple(
+            f"images of {bands} do not say how long they were exposed (EXIF): they are brought to one exposure by what they share"
+            for bands in untimed
+        )
         calibrated = all(each.panels for each in lines.values())
         if not calibrated:
             warnings = (
@@ -157,7 +169,7 @@ def normalised_difference(a: Raster, b: Raster) -> Raster:
 
 def _sources(place: Ground, bands: Sequence[str], progress: Progress) -> dict[str, _Source]:
     """Mosaics of light that hold the bands; one that holds both is made once."""
-    made: dict[int, Mosaic] = {}
+    made: dict[int, tuple[Mosaic, npt.NDArray[np.float32]]] = {}
     found = {}
     for band in bands:
         layer = _layer_with(place.block, band)
@@ -165,12 +177,26 @@ def _sources(place: Ground, bands: Sequence[str], progress: Progress) -> dict[st
             folder = place.folder / f"light{len(made)}"
             folder.mkdir()
             bright = replace(layer, dtype=np.dtype(np.float32))
-            made[id(layer)] = mosaic(
+            laid = mosaic(
                 place.block, bright, place.scene, place.surface, place.grid, folder,
                 lambda n: progress("images", n), _loader(place.block),
             )  # fmt: skip
-        found[band] = _Source(layer, made[id(layer)], layer.bands.index(band))
+            made[id(layer)] = laid, _factors(layer, laid)
+        found[band] = _Source(layer, made[id(layer)][0], layer.bands.index(band), made[id(layer)][1])
     return found
+
+
+def _timed(layer: Layer) -> bool:
+    """Whether all images say how long they were exposed: then their light can be compared."""
+    return all(states_exposure(image.path) for image in layer.images)
+
+
+def _factors(layer: Layer, laid: Mosaic) -> npt.NDArray[np.float32]:
+    """What brings the light of images to one exposure: 1 where they say how they were exposed, else what they share tells."""
+    value, there = laid.shared.value, laid.shared.image != NOBODY
+    if _timed(layer) or not there.any():
+        return np.ones((len(layer.images), len(layer.bands)), np.float32)
+    return gains(laid.shared, len(layer.images), float(np.percentile(value[there], _BRIGHTEST)))
 
 
 def _loader(block: Block) -> Callable[[Image], npt.NDArray[Any]]:
@@ -235,20 +261,20 @@ def _reflectance(values: Raster, line: Line) -> Raster:
 
 
 def _drape(
-    task: Task, place: Ground, layers: Mapping[str, Layer], lines: Mapping[str, Line], progress: Progress
+    task: Task, place: Ground, sources: Mapping[str, _Source], lines: Mapping[str, Line], progress: Progress
 ) -> None:
     """The cloud with the index of each point that images of both bands see."""
     bands: dict[str, Raster] = {}
-    for band, layer in layers.items():
+    for band, source in sources.items():
+        layer = source.layer
         bright = replace(layer, dtype=np.dtype(np.float32))
         folder = place.folder / f"points_{band}"
         folder.mkdir()
         views = room(place.scene.size, bright, folder)
         paint(place.block, bright, place.scene, views, lambda n: progress("points", n), _loader(place.block))
-        ones = np.ones((len(layer.images), len(layer.bands)), np.float32)
         bands[band] = mapped(folder / "band", np.float32, (place.scene.size,))
         for square in place.scene.squares:
-            values = blend(part(views, square.points), ones, 1.0, 1)[:, layer.bands.index(band)]
+            values = blend(part(views, square.points), source.factor, 1.0, 1)[:, source.plane]
             bands[band][place.scene.number[square.points]] = _reflectance(values, lines[band])
     upper, lower = INDICES[task.index]
     assert task.draped is not None

@@ -78,7 +78,7 @@ def mosaic(
     grid: Grid,
     folder: Path,
     progress: Progress,
-    load: Load = plain,
+    load: Load | None = None,
 ) -> Mosaic:
     """Lay a layer on a surface.
 
@@ -95,9 +95,10 @@ def mosaic(
         For its arrays.
     progress : callable
         Told of images done, twice for those that give whole objects.
-    load : callable
-        Gives the picture of an image, shape (height, width, planes).
+    load : callable, optional
+        Gives the picture of an image, shape (height, width, planes). Default: `plain`.
     """
+    load = load or plain(block)
     shape = (grid.rows, grid.columns)
     best = mapped(folder / "best", np.float32, shape)
     image = mapped(folder / "shows", np.uint16, shape)

@@ -18,6 +18,7 @@ from groundproc.imagery.painting.block import Block, Image, Layer
 from groundproc.imagery.painting.scene import Scene, Square, mapped, towards
 from groundproc.imagery.painting.views import Views
 from groundproc.imagery.painting.visibility import Depths, Seen, project
+from groundproc.imagery.radiance import evened
 
 Load = Callable[[Image], npt.NDArray[Any]]
 """Gives the picture of an image, shape (height, width, planes)."""
@@ -42,9 +43,13 @@ class Painted(NamedTuple):
     failed: tuple[str, ...]
 
 
-def plain(image: Image) -> npt.NDArray[Any]:
-    """The picture as the file has it."""
-    return pictures.picture(image.path)
+def plain(block: Block) -> Load:
+    """Pictures as the files have them, but for the fall of light to their corners where the rig knows it."""
+
+    def loaded(image: Image) -> npt.NDArray[Any]:
+        return evened(pictures.picture(image.path), block.rig.cameras[image.camera])
+
+    return loaded
 
 
 def room(size: int, layer: Layer, folder: Path) -> Views:
@@ -66,7 +71,7 @@ def part(views: Views, points: slice) -> Views:
 
 
 def paint(
-    block: Block, layer: Layer, scene: Scene, views: Views, progress: Callable[[int], object], load: Load = plain
+    block: Block, layer: Layer, scene: Scene, views: Views, progress: Callable[[int], object], load: Load | None = None
 ) -> Painted:
     """Lay all images of a layer over the points of a scene.
 
@@ -79,8 +84,10 @@ def paint(
         Of all its points; filled.
     progress : callable
         Told of images done.
-    load : callable
+    load : callable, optional
+        Default: `plain`.
     """
+    load = load or plain(block)
     locks = {id(square): threading.Lock() for square in scene.squares}
 
     def one(number: int) -> tuple[int, str]:

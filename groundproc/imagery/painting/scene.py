@@ -56,7 +56,7 @@ class Scene:
     site : Site
         What its coordinates mean.
     folder : Path
-        For some 40 bytes a point.
+        For some 56 bytes a point.
     progress : callable
         Told of points read.
     """
@@ -69,9 +69,9 @@ class Scene:
         self.spacing_m = mapped(folder / "spacing", np.float32, (self.size,))
         self.number = mapped(folder / "number", np.int64, (self.size,))
         """Place of each point in the file."""
-        self._normal = mapped(folder / "normal", np.float16, (self.size, 3))
-        self._rough_m = mapped(folder / "rough", np.float16, (self.size,))
-        self._above_m = mapped(folder / "above", np.float16, (self.size,))
+        self._normal = mapped(folder / "normal", np.float32, (self.size, 3))
+        self._rough_m = mapped(folder / "rough", np.float32, (self.size,))
+        self._above_m = mapped(folder / "above", np.float32, (self.size,))
         self.squares: list[Square] = []
         first = 0
         for place in sorted(spool.counts):
@@ -97,9 +97,12 @@ class Scene:
         """What is known of the points of a square, in coordinates from its centre."""
         points = square.points
         return Surface(
-            self.xyz_m[points], self.spacing_m[points], self._normal[points].astype(np.float32),
-            self._rough_m[points].astype(np.float32), self._above_m[points].astype(np.float32),
-        )  # fmt: skip
+            self.xyz_m[points],
+            self.spacing_m[points],
+            self._normal[points],
+            self._rough_m[points],
+            self._above_m[points],
+        )
 
 
 def mapped(path: Path, dtype: npt.DTypeLike, shape: tuple[int, ...]) -> npt.NDArray[Any]:

@@ -91,13 +91,13 @@ def textured(
     texels = [
         _texels(block, layer, chart, (spacing_m, cell_m), folder / str(number)) for number, chart in enumerate(made)
     ]
-    failed = []
+    failed, load = [], plain(block)
     for number, image in enumerate(layer.images):
         found = depths_of(block, image, scene)
         if found is None:
             continue
         try:
-            shown = plain(image)
+            shown = load(image)
         except CaptureError as error:
             failed.append(str(error))
             continue

@@ -46,7 +46,9 @@ def insert(views: Views, picture: npt.NDArray[Any], seen: Seen, weight: npt.NDAr
     _insert(views, picture, seen.number, seen.pixel, weight, np.uint16(image))
 
 
-def blend(views: Views, gain: npt.NDArray[np.float32], full: float, least: int) -> npt.NDArray[np.float32]:
+def blend(
+    views: Views, gain: npt.NDArray[np.float32], full: float, least: int, differ: float | None = None
+) -> npt.NDArray[np.float32]:
     """What the views of each point agree on.
 
     Parameters
@@ -58,6 +60,8 @@ def blend(views: Views, gain: npt.NDArray[np.float32], full: float, least: int) 
         Full scale of the numbers.
     least : int
         Views that a point needs.
+    differ : float, optional
+        What views of one thing differ by anyway; default: a share of the full scale.
 
     Returns
     -------
@@ -65,7 +69,7 @@ def blend(views: Views, gain: npt.NDArray[np.float32], full: float, least: int) 
         Not a number where there are fewer.
     """
     out = np.full((len(views.total), views.value.shape[2]), np.nan, np.float32)
-    _blend(views, gain, _FLOOR * full, least, out)
+    _blend(views, gain, _FLOOR * full if differ is None else differ, least, out)
     return out
 
 

@@ -39,6 +39,8 @@ _CLOSED: Final = 1.7
 """Radius of the circles that fit into no gap, in spacings: with a disc's, points at random leave one gap in 300,000."""
 _FINE: Final = 2.5
 """Pixels of the depth image that points stand apart."""
+ROLLS: Final = 3
+"""Times that a pixel's row is looked up for a rolling shutter: each takes what is left by a hundredth or so."""
 _NODES: Final = 32
 """Places along each side of a picture at which the directions of its rays are known."""
 
@@ -55,6 +57,8 @@ class Eye(NamedTuple):
         Projection centre in the local frame.
     size_px : ndarray of int64, shape (2,)
         Width and height.
+    row_m : ndarray, shape (3,)
+        By which it moves from row to row of a rolling shutter; `place_m` is the middle row's.
     """
 
     kind: int
@@ -62,6 +66,7 @@ class Eye(NamedTuple):
     mat_cam_local: Array
     place_m: Array
     size_px: npt.NDArray[np.int64]
+    row_m: Array
 
 
 class Seen(NamedTuple):
@@ -97,11 +102,11 @@ class Surface(NamedTuple):
     xyz_m : ndarray of float32, shape (n, 3)
     spacing_m : ndarray of float32, shape (n,)
         Distance to the neighbours.
-    normal : ndarray of float16, shape (n, 3)
+    normal : ndarray of float32, shape (n, 3)
         Of length 1 where it points outwards, 1/2 where nobody knows which side that is, 0 where there is no plane.
-    rough_m : ndarray of float16, shape (n,)
+    rough_m : ndarray of float32, shape (n,)
         Standard deviation across the plane.
-    above_m : ndarray of float16, shape (n,)
+    above_m : ndarray of float32, shape (n,)
         How far the point lies off its plane, along the normal.
     """
 
@@ -201,16 +206,35 @@ def _project(eye: Any, xyz: Any, number: Any, pixel: Any, ranges: Any) -> int:
     ray, place = np.empty(3), np.empty(2)
     mat, at = eye.mat_cam_local, eye.place_m
     right, down = eye.size_px[0] - 0.5, eye.size_px[1] - 0.5
+    late = mat @ eye.row_m
+    rolls, middle = (eye.row_m != 0.0).any(), 0.5 * (eye.size_px[1] - 1)
     for i in range(len(xyz)):
         x, y, z = xyz[i, 0] - at[0], xyz[i, 1] - at[1], xyz[i, 2] - at[2]
         for row in range(3):
             ray[row] = mat[row, 0] * x + mat[row, 1] * y + mat[row, 2] * z
-        if projected(eye.kind, eye.lens, ray, place) and -0.5 <= place[0] <= right and -0.5 <= place[1] <= down:
+        reached = projected(eye.kind, eye.lens, ray, place)
+        if rolls and reached:
+            reached = _rolled(eye, ray, late, middle, place)
+        if reached and -0.5 <= place[0] <= right and -0.5 <= place[1] <= down:
             number[count] = i
             pixel[count, 0], pixel[count, 1] = place[0], place[1]
             ranges[count] = np.sqrt(x * x + y * y + z * z)
             count += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def _rolled(eye: Any, ray: Any, late: Any, middle: float, place: Any) -> bool:
+    """The pixel of a ray of the middle row as the camera has it that moves on until the pixel's own row."""
+    own, reached = np.empty(3), True
+    for _ in range(ROLLS):
+        rows = min(max(place[1] - middle, -middle - 1.0), middle + 1.0)
+        for axis in range(3):
+            own[axis] = ray[axis] - rows * late[axis]
+        reached = projected(eye.kind, eye.lens, own, place)
+        if not reached:
+            break
+    return reached
 
 
 @njit(cache=True, nogil=True)

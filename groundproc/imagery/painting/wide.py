@@ -18,7 +18,7 @@ from groundproc.imagery.painting.block import Block, Image, eye_of
 from groundproc.imagery.painting.paint import depths_of
 from groundproc.imagery.painting.scene import Scene
 from groundproc.imagery.painting.views import MOST, NOBODY, Views, sampled
-from groundproc.imagery.painting.visibility import Depths
+from groundproc.imagery.painting.visibility import ROLLS, Depths
 
 Array = npt.NDArray[np.float64]
 Raster = npt.NDArray[np.float32]
@@ -246,15 +246,20 @@ def _points(camera: Camera, rows: Any, columns: Any, pose: tuple[Array, Array], 
 def _looked_up(source: _Source, points: Array) -> tuple[npt.NDArray[np.intp], Array, Array]:
     """Which points a source sees, what it shows there, shape (k, planes), and with what weight."""
     eye = source.image.eye
+    size = np.array([source.camera.width_px, source.camera.height_px])
     way = points - eye.place_m
     pixel, inside = source.camera.project(way @ eye.mat_cam_local.T)
+    for _ in range(ROLLS if eye.row_m.any() else 0):
+        rows = np.nan_to_num(pixel[:, 1:] - source.camera.middle_row_px)
+        pixel, inside = source.camera.project(
+            (way - np.clip(rows, -size[1], size[1]) * eye.row_m) @ eye.mat_cam_local.T
+        )
     inside &= np.isfinite(pixel).all(axis=1)
     if source.depths is not None:
         distance = np.linalg.norm(way, axis=1)
         near = source.depths.at(np.where(inside[:, None], pixel, 0.0))
         inside &= distance - near <= _BEHIND_M + _BEHIND * distance
     some = np.flatnonzero(inside)
-    size = np.array([source.camera.width_px, source.camera.height_px])
     edge = np.minimum(pixel[some] + 0.5, size - 0.5 - pixel[some]).clip(1e-3) / (0.5 * size)
     return some, sampled(source.shown, pixel[some].astype(np.float32)), np.prod(np.minimum(edge, 1.0), axis=1) ** _SEAM
 

@@ -19,6 +19,7 @@ from groundproc.imagery.painting.block import POSES, RIG, Block, Image, load
 from groundproc.imagery.painting.scene import Scene
 from groundproc.imagery.painting.wide import Instant, Wide, instants, merged, posed, wide_of
 from groundproc.imagery.poses import NO_TIME, ImagePoses, read_poses, write_poses
+from groundproc.imagery.radiance import evened
 from groundproc.imagery.rig import Rig, RigCamera, write_rig
 from groundproc.imagery.rotations import photogrammetric
 
@@ -110,7 +111,8 @@ def wide(task: Task, progress: Progress) -> Made:
 
     def shown(image: Image) -> tuple[tuple[str, ...], npt.NDArray[np.float32]]:
         layer = kinds[image.name]
-        return layer.bands, pictures.picture(image.path).astype(np.float32) / np.float32(layer.full)
+        shown = evened(pictures.picture(image.path), block.rig.cameras[image.camera])
+        return layer.bands, shown.astype(np.float32) / np.float32(layer.full)
 
     make_folder(task.output)
     names: list[str] = []
