@@ -245,7 +245,7 @@ def adjust_run(
 def _redo(tracker: Tracker, motion: Motion, early: list[Slice]) -> None:
     """The beginning again, before the first window; its slices are not kept after that."""
     if early and tracker.track is not None and tracker.odometry is not None:
-        redo_beginning(tracker.track, motion, early, tracker.odometry.state)
+        redo_beginning(tracker.track, motion, early, tracker.odometry)
     early.clear()
 
 

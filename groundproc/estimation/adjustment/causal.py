@@ -119,7 +119,7 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
         if tracker.keep and tracker.track is not None and tracker.odometry is not None:
             early.append(piece)
             if len(tracker.track) >= SETTLING:
-                redo_beginning(tracker.track, motion, early, tracker.odometry.state, FIRST)
+                redo_beginning(tracker.track, motion, early, tracker.odometry, FIRST)
                 tracker.keep = False
                 tracker.track.forget(len(tracker.track))
                 early.clear()

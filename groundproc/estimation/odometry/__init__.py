@@ -9,6 +9,8 @@ spline      the path of the sensor, and the spline that corrects it
 stated      positions and attitudes of the autopilot, as they become known
 state       where the sensor is, and how the inertial data carry that on
 matching    distances of clusters from the map, and the correction by them
+within      turns within a slice, between two corrections
+rotor       the line of the spin, in time
 odometry    the two as an iterated error-state filter; the causal mode
 start       the rough pose that it begins from
 bearing     the heading of its map against the earth's

@@ -31,7 +31,7 @@ SURE_M: Final = 0.15
 
 
 def redo_beginning(
-    track: Track, motion: Motion, early: Sequence[Slice], state: State, count: int | None = None
+    track: Track, motion: Motion, early: Sequence[Slice], before: Odometry, count: int | None = None
 ) -> None:
     """Run the first slices again and put the result into the track.
 
@@ -41,8 +41,8 @@ def redo_beginning(
     motion : Motion
     early : sequence of Slice
         The first slices.
-    state : State
-        Of the odometry at the end of the track: biases and gravity, which are known by then.
+    before : Odometry
+        As it is at the end of the track: biases, gravity and the line of the spin are known by then.
     count : int, optional
         Slices that are run again; where left out `BEGINNING`, and no more than a third of a track that is short.
     """
@@ -57,11 +57,13 @@ def redo_beginning(
         0, -motion.rate_rad_s[grid][::-1], motion.force_m_s2[grid][::-1].copy(), motion.known[grid][::-1],
         motion.rate_density, motion.force_density, motion.source,
     )  # fmt: skip
+    state = before.state
     begin = State(
         track.quat[count].copy(), track.position_m[count].copy(), -track.velocity_m_s[count - 1],
         -track.gyro_bias[count - 1], state.accel_bias_m_s2.copy(), state.gravity_m_s2.copy(), np.diag(SIGMA**2),
     )  # fmt: skip
     odometry = Odometry(begin, reversed_motion, 0, track.voxel_m)
+    odometry.line = before.line.reversed()
     odometry.map = _map_of(track, motion, count, min(count + AFTER, len(track)))
     found: dict[int, tuple[State, Step | None]] = {}
     for piece in reversed(early):
@@ -84,6 +86,7 @@ def redo_beginning(
         track.quat[k], track.position_m[k] = at.quat, at.position_m
         track.velocity_m_s[k], track.gyro_bias[k] = -at.velocity_m_s, -at.gyro_bias_rad_s
         track.sigma[k] = np.sqrt(np.diag(at.covariance)[:6])
+        track.quats[k] = None if seen is None else seen.quats[::-1].copy()
         if seen is None:
             continue
         # all of a slice's clusters again, for the old ones were made with a wrong motion
@@ -97,7 +100,7 @@ def redo_beginning(
 def _map_of(track: Track, motion: Motion, first: int, last: int) -> PlaneMap:
     """The planes of slices `first` to `last`."""
     planes = PlaneMap(track.voxel_m)
-    path = track.path(motion, first, last)
+    path = track.causal_path(motion, first, last)
     for clusters in track.clusters[first:last]:
         if not len(clusters):
             continue

@@ -142,6 +142,8 @@ class MotionGrid(Protocol):
         Whether samples say it.
     rate_density, force_density : float
         Noise as in `ImuTrack`.
+    source : str
+        Whose rates these are.
     """
 
     @property
@@ -167,6 +169,10 @@ class MotionGrid(Protocol):
     @property
     def force_density(self) -> float:
         """Noise of the forces."""
+
+    @property
+    def source(self) -> str:
+        """Whose rates these are."""
 
     def __len__(self) -> int: ...
 

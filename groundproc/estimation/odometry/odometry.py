@@ -12,12 +12,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flightlog import frames
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.matching import update
-from groundproc.estimation.odometry.motion import MotionGrid
+from groundproc.estimation.odometry.motion import LIDAR, MotionGrid
+from groundproc.estimation.odometry.rotor import Line
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
 from groundproc.estimation.odometry.state import POSITION, ROTATION, STATES, STEP_S, State, apply, propagate
 from groundproc.estimation.odometry.voxels import COUNT, MEAN, SCATTER, PlaneMap
+from groundproc.estimation.odometry.within import Seen, Within
 from groundproc.numerics.rotations import mat_of_quat, quat_difference
 
 Array = npt.NDArray[np.float64]
@@ -47,6 +50,8 @@ class Step:
         RMS distance from it.
     unheld_m, next_unheld_m : float
         Sigmas of the two directions that they tell least of; infinite before there is a map.
+    quats : ndarray, shape (STEPS + 1, 4)
+        Attitudes on the grid over the slice, corrected, as they are stated.
     """
 
     number: int
@@ -62,6 +67,7 @@ class Step:
     residual_m: float
     unheld_m: float
     next_unheld_m: float
+    quats: Array
 
 
 class Odometry:
@@ -88,6 +94,8 @@ class Odometry:
         self.map = PlaneMap(voxel_m)
         self._cluster = Clusterer(voxel_m)
         self._ground = np.zeros(3)
+        self.line = Line()
+        self._within = Within(max(motion.rate_density, 1e-6))
         density = 2.0 * max(motion.rate_density, 1e-6), 3.0 * max(motion.force_density, 1e-4)
         step = STEP_S
         self._noise = np.concatenate(
@@ -108,49 +116,63 @@ class Odometry:
             part = slice(first, first + 10_000)
             self.map.insert(rows[part, MEAN : MEAN + 3].copy(), clusters[part], self.MOST)
 
-    def propagate(self, to: int) -> tuple[Array, Array]:
-        """Carry the state on to the end of slice `to`; poses on the grid over that slice, (STEPS + 1, 4) and (STEPS + 1, 3)."""
+    def propagate(self, to: int) -> None:
+        """Carry the state on to the end of slice `to`."""
+        while self.number <= to:
+            self._carry(*self._inertial(self.number))
+            self._within.forget()
+
+    def _inertial(self, number: int) -> tuple[Array, Array]:
+        """Rates and forces over a slice."""
+        part = slice(number * STEPS, number * STEPS + STEPS)
+        rate, force = self._motion.rate_rad_s[part], self._motion.force_m_s2[part]
+        if len(rate) < STEPS:
+            raise IndexError(f"slice {number} lies beyond the inertial data")
+        return rate, force
+
+    def _carry(self, rate: Array, force: Array) -> tuple[Array, Array]:
+        """Carry the state on over a slice; poses on the grid over it, shape (STEPS + 1, 4) and (STEPS + 1, 3)."""
         quats, positions = np.empty((STEPS + 1, 4)), np.empty((STEPS + 1, 3))
         s = self.state
-        while self.number <= to:
-            first = self.number * STEPS
-            part = slice(first, first + STEPS)
-            rate, force = self._motion.rate_rad_s[part], self._motion.force_m_s2[part]
-            if len(rate) < STEPS:
-                raise IndexError(f"slice {self.number} lies beyond the inertial data")
-            s.covariance = propagate(rate, force, s.arrays, s.covariance, self._noise, (quats, positions))
-            self.number += 1
+        s.covariance = propagate(rate, force, s.arrays, s.covariance, self._noise, (quats, positions))
+        self.number += 1
         return quats, positions
 
     def step(self, piece: Slice) -> Step:
         """Take the next slice: propagate, match, correct, and add it to the map."""
-        quats, positions = self.propagate(piece.number)
+        self.propagate(piece.number - 1)
+        rate, force = self._inertial(piece.number)
+        if self._motion.source == LIDAR:
+            rate = rate - self.line.read(self._motion, piece)
+        quats, positions = self._carry(rate, force)
         start_ns = self._motion.start_ns + piece.number * STEPS * STEP_NS
         clusters, world = self._cluster(piece, start_ns, quats, positions)
         s = self.state
         matched, residual, unheld = 0, float("nan"), (float("inf"), float("inf"))
-        # in the body at the slice's end, where the prediction between the instants stands
-        mat = np.empty((3, 3))
-        mat_of_quat(s.quat, mat)
-        before = mat.copy()
-        body = (world - s.position_m) @ mat
         if self.map.count:
+            # in the body at the slice's end, where the prediction between the instants stands
+            before, end_m = _mat(s.quat), s.position_m.copy()
+            body = (world - end_m) @ before
             matched, residual, unheld, s.covariance = update(
                 self.map.arrays, body, clusters["count"], s.arrays, s.covariance, self._ground
             )
-            mat_of_quat(s.quat, mat)
-            world = body @ mat.T + s.position_m
+            # the slice is corrected as one rigid piece
+            turn = _mat(s.quat) @ before.T
+            positions, world = (s.position_m + (each - end_m) @ turn.T for each in (positions, world))
+            quats = frames.quat_multiply(frames.quat_from_mat(turn[None]), quats)
+            seen = Seen(clusters["time_ns"] - start_ns, world, clusters["count"])
+            within = self._within(seen, positions, turn, (self.map.arrays, self._ground))
+            quats = frames.quat_multiply(frames.quat_exp(within), quats)
         self.map.insert(world, clusters, self.MOST)
-        seen = len(clusters)
+        count = len(clusters)
         if piece.laser is not None:
             # these would weigh more in the filter, for each has a surface's roughness of its own
             clusters, world = self._cluster(piece, start_ns, quats, positions, apart=True)
-            world = (world - positions[-1]) @ before @ mat.T + s.position_m
         if piece.number % 50 == 0:
             self.map.forget_beyond(s.position_m, self.REACH_M)
         return Step(
             piece.number, s.quat.copy(), s.position_m.copy(), s.velocity_m_s.copy(), s.gyro_bias_rad_s.copy(),
-            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, seen, matched, residual, *unheld,
+            np.sqrt(np.diag(s.covariance)[:6]), clusters, world, count, matched, residual, *unheld, quats,
         )  # fmt: skip
 
     def position_fix(self, position_m: Array, sigma_m: Array) -> None:
@@ -167,8 +189,7 @@ class Odometry:
     def attitude_fix(self, quat: Array, sigma_rad: Array) -> None:
         """Take an attitude of the sensor, shape (4,), with its sigmas about the map's axes."""
         s = self.state
-        mat = np.empty((3, 3))
-        mat_of_quat(s.quat, mat)
+        mat = _mat(s.quat)
         off = np.empty(3)
         quat_difference(s.quat, quat, off)  # in the body
         observed = np.zeros((3, STATES))
@@ -181,3 +202,10 @@ class Odometry:
 
     def _correct(self, error: Array) -> None:
         apply(error, self.state.arrays)
+
+
+def _mat(quat: Array) -> Array:
+    """Column matrix of a quaternion."""
+    mat = np.empty((3, 3))
+    mat_of_quat(quat, mat)
+    return mat

@@ -44,6 +44,8 @@ class Track:
     residual_m : list of float
     unheld_m, next_unheld_m : list of float
         Sigmas of the two directions that a slice tells least of.
+    quats : list of ndarray or None
+        Attitudes on the grid of each slice, shape (STEPS + 1, 4); None where nothing was seen.
     restarts : int
         How often it lost its way.
     astray : int
@@ -66,6 +68,7 @@ class Track:
     residual_m: list[float] = field(default_factory=list)
     unheld_m: list[float] = field(default_factory=list)
     next_unheld_m: list[float] = field(default_factory=list)
+    quats: list[Array | None] = field(default_factory=list)
     restarts: int = 0
     astray: int = 0
     fixes: int = 0
@@ -85,21 +88,25 @@ class Track:
             start_ns, rate, np.array(self.quat[start : end + 1]), np.array(self.position_m[start : end + 1])
         )
 
-    def causal_path(self, motion: MotionGrid, start: int = 0) -> Path:
-        """The path from slice `start` on as known at the end of each slice: nothing of what came later is in it."""
-        count = len(self) - start
-        grid = slice((self.first + start) * STEPS, (self.first + len(self)) * STEPS)
-        rate = motion.rate_rad_s[grid] - np.repeat(np.array(self.gyro_bias[start:]), STEPS, axis=0)
-        quats, places = np.array(self.quat[start:]), np.array(self.position_m[start:])
-        speeds = np.array([self.velocity_m_s[max(start - 1, 0)], *self.velocity_m_s[start:]])
+    def causal_path(self, motion: MotionGrid, start: int = 0, end: int | None = None) -> Path:
+        """The path over slices `start` to `end` as known at the end of each slice: nothing of what came later is in it."""
+        end = len(self) if end is None else end
+        count = end - start
+        grid = slice((self.first + start) * STEPS, (self.first + end) * STEPS)
+        rate = motion.rate_rad_s[grid] - np.repeat(np.array(self.gyro_bias[start:end]), STEPS, axis=0)
+        quats, places = np.array(self.quat[start : end + 1]), np.array(self.position_m[start : end + 1])
+        speeds = np.array([self.velocity_m_s[max(start - 1, 0)], *self.velocity_m_s[start:end]])
         share = (np.arange(STEPS) / STEPS)[:, None]
         step_s = SLICE_NS * 1e-9
         quat, position = np.empty((count * STEPS + 1, 4)), np.empty((count * STEPS + 1, 3))
         for i in range(count):
-            free = integrated(rate[i * STEPS : (i + 1) * STEPS], quats[i])
-            off = frames.quat_log(frames.quat_multiply(frames.quat_inverse(free[-1:]), quats[i + 1 : i + 2]))
-            part = slice(i * STEPS, (i + 1) * STEPS)
-            quat[part] = frames.quat_multiply(free[:-1], frames.quat_exp(share * off))
+            part, found = slice(i * STEPS, (i + 1) * STEPS), self.quats[start + i]
+            if found is None:
+                free = integrated(rate[i * STEPS : (i + 1) * STEPS], quats[i])
+                off = frames.quat_log(frames.quat_multiply(frames.quat_inverse(free[-1:]), quats[i + 1 : i + 2]))
+                quat[part] = frames.quat_multiply(free[:-1], frames.quat_exp(share * off))
+            else:
+                quat[part] = found[:-1]
             rise = places[i + 1] - places[i]
             # a cubic through both ends with the filter's velocities
             position[part] = (
@@ -115,7 +122,7 @@ class Track:
         self.first += slices
         for table in (
             self.quat, self.position_m, self.velocity_m_s, self.gyro_bias, self.sigma, self.clusters, self.matched,
-            self.seen, self.residual_m, self.unheld_m, self.next_unheld_m,
+            self.seen, self.residual_m, self.unheld_m, self.next_unheld_m, self.quats,
         ):  # fmt: skip
             del table[:slices]
 

@@ -157,6 +157,7 @@ class Tracker:
         track.matched.append(0 if step is None else step.matched)
         track.seen.append(0 if step is None else step.seen)
         track.residual_m.append(float("nan") if step is None else step.residual_m)
+        track.quats.append(None if step is None else step.quats)
         track.unheld_m.append(float("inf") if step is None else step.unheld_m)
         track.next_unheld_m.append(float("inf") if step is None else step.next_unheld_m)
         if step is None or not self.keep:
