@@ -27,10 +27,11 @@ from groundproc.trajectory.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
-FIRST: Final = 30
-"""Slices at the beginning, flown when there was no map yet, that are run again against what came after: they are stated late."""
-SETTLING: Final = 60
-"""Slices after which that is done: six seconds."""
+SETTLING: Final = (60, 150)
+"""Slices after which there is a map that the first half of them, flown when there was none yet, is run again against, and so stated late:
+six seconds where the lidar holds the path well, and up to fifteen where it does not."""
+HELD_M: Final = 0.05
+"""Sigma of the direction that a slice tells least of, in the last second, from which on it holds the path well."""
 
 
 @dataclass(slots=True)
@@ -118,10 +119,16 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
         tracker.feed(piece)
         if tracker.keep and tracker.track is not None and tracker.odometry is not None:
             early.append(piece)
-            if len(tracker.track) >= SETTLING:
-                redo_beginning(tracker.track, motion, early, tracker.odometry, FIRST)
+            if _is_settled(tracker.track):
+                redo_beginning(tracker.track, motion, early, tracker.odometry, len(tracker.track) // 2)
                 tracker.keep = False
                 tracker.track.forget(len(tracker.track))
                 early.clear()
     track = tracked(tracker)
     return CausalRun(track.causal_path(motion), track, motion, positions.sigma_m[0])
+
+
+def _is_settled(track: Track) -> bool:
+    """Whether there is a map that the beginning can be run again against."""
+    fewest, most = SETTLING
+    return len(track) >= most or (len(track) >= fewest and float(np.median(track.unheld_m[-10:])) < HELD_M)
