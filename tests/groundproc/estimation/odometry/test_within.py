@@ -52,7 +52,7 @@ def wandering(rng: np.random.Generator, first_rad: Array) -> Array:
 
 
 def test_what_a_gyro_gathers_within_a_slice_is_found() -> None:
-    """Slice after slice: the filter has taken out the mean of each, and of what is left of the walk a quarter is found, with weights as careful as the filter's."""
+    """The filter has taken out the mean of each: a quarter of what is left is found, with weights as careful as the filter's."""
     rng = np.random.default_rng(4)
     planes, places, within = room(rng), np.zeros((STEPS + 1, 3)), Within(DENSITY)
     end, before, after = np.zeros(3), [], []
