@@ -9,10 +9,21 @@ import threading
 from collections.abc import Generator, Iterator
 from typing import Final, TypeVar
 
+from groundproc.system import cores
+
 T = TypeVar("T")
 
 _DEPTH: Final = 1
 """Pieces that wait: one is used, one waits, one is being made."""
+
+
+def _closed(items: Iterator[T]) -> Iterator[T]:
+    """The items; the iterator is closed when this is left."""
+    try:
+        yield from items
+    finally:
+        if isinstance(items, Generator):
+            items.close()
 
 
 class _End:
@@ -25,7 +36,7 @@ class _End:
 def ahead(
     items: Iterator[T], lock: "contextlib.AbstractContextManager[object] | None" = None
 ) -> Generator[T, None, None]:
-    """The items of an iterator, made by a thread of its own that begins with the first one asked for.
+    """The items of an iterator, made by a thread of its own that begins with the first one asked for; on one core by the same one.
 
     An error of the iterator comes where the item would have come. Left before the end, it is to be closed: then the thread has ended.
 
@@ -36,6 +47,9 @@ def ahead(
     lock : context manager, optional
         Held while an item is made: iterators that share something share one.
     """
+    if cores() == 1:  # nothing is gained, and flights that share a computer are not to take more than their part
+        yield from _closed(items)
+        return
     made: queue.SimpleQueue[T | _End] = queue.SimpleQueue()
     room, over = threading.Semaphore(_DEPTH), threading.Event()
     held = lock or contextlib.nullcontext()

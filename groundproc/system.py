@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+THREADS: Final = "NUMBA_NUM_THREADS"
+"""The variable of the environment that says how many threads kernels may take; ours follow it."""
 LIMITED: Final = os.name == "posix" and importlib.util.find_spec("resource") is not None
 """Whether a process can be started that has limits and shares memory by a descriptor."""
 _QUERY: Final = 0x1000
@@ -18,10 +20,10 @@ _STILL_ACTIVE: Final = 259
 
 
 def cores() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0)) or 1
-    return os.cpu_count() or 1
+    """Processors that this process may use: those that the system gives it, or fewer where it was told so."""
+    given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    told = os.environ.get(THREADS, "")
+    return min(given, int(told)) if told.isdecimal() and int(told) else given
 
 
 def alive(pid: int) -> bool:

@@ -1,6 +1,8 @@
 """Clouds as COPC 1.0 (copc.io): a LAZ file whose chunks are the nodes of an octree, so that a viewer reads what it shows and no more."""
 
+import contextlib
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -12,6 +14,7 @@ from laspy.vlrs.known import LasZipVlr
 from flightlog.errors import SourceError
 from groundproc.cloud.octree import Cube, Key, Octree
 from groundproc.cloud.spool import Records
+from groundproc.readahead import ahead
 
 _AT_ONCE: Final = 1_000_000
 """Points that are handed to the compressor together: its threads share whole nodes."""
@@ -92,20 +95,27 @@ class CopcBuilder:
         compressor = lazrs.ParLasZipCompressor(file, packer)
         keys: list[Key] = []
         counts: list[int] = []
-        waiting: list[bytes] = []
-        points = 0
-        for key, records in self._octree.nodes():
-            keys.append(key)
-            counts.append(len(records))
-            waiting.append(records.tobytes())
-            points += len(records)
-            if points >= _AT_ONCE:
-                compressor.compress_chunks(waiting)
-                waiting, points = [], 0
-        if waiting:
-            compressor.compress_chunks(waiting)
+        with contextlib.closing(ahead(self._batches())) as batches:
+            for nodes in batches:
+                keys += [key for key, _ in nodes]
+                counts += [len(records) // self._header.point_format.size for _, records in nodes]
+                compressor.compress_chunks([records for _, records in nodes])
+                del nodes  # the next ones take their memory
         compressor.done()
         return keys, counts
+
+    def _batches(self) -> Iterator[list[tuple[Key, bytes]]]:
+        """Nodes and their records, as many at once as keep all threads of the compressor busy."""
+        waiting: list[tuple[Key, bytes]] = []
+        points = 0
+        for key, records in self._octree.nodes():
+            waiting.append((key, records.tobytes()))
+            points += len(records)
+            if points >= _AT_ONCE:
+                yield waiting
+                waiting, points = [], 0
+        if waiting:
+            yield waiting
 
     def _info(self, cube: Cube, root: int, size: int) -> bytes:
         """The info record."""

@@ -65,9 +65,7 @@ class Cube:
     def within(self, records: Records) -> Numbers:
         """Units from the corner, shape (n, 3)."""
         out = np.empty((len(records), 3), np.int64)
-        for axis, name in enumerate("XYZ"):
-            steps = records[name].astype(np.int64) - self.corner[axis]
-            out[:, axis] = np.minimum(steps * self.units[axis], (1 << _ROOT_BITS) - 1)
+        _within(records["X"], records["Y"], records["Z"], self.corner, self.units, out)
         return out
 
 
@@ -211,6 +209,16 @@ def _morton(place: Place) -> int:
     """Order of squares in which neighbours lie near each other."""
     x, y = place[0] + (1 << 31), place[1] + (1 << 31)
     return sum((x >> bit & 1) << 2 * bit | (y >> bit & 1) << 2 * bit + 1 for bit in range(33))
+
+
+@njit(cache=True, nogil=True)
+def _within(x: Any, y: Any, z: Any, corner: Any, units: Any, out: Any) -> None:
+    """Units from the corner of the root, none beyond its other end."""
+    last = float((1 << _ROOT_BITS) - 1)
+    for n in range(len(x)):
+        out[n, 0] = np.int64(min((np.int64(x[n]) - corner[0]) * units[0], last))
+        out[n, 1] = np.int64(min((np.int64(y[n]) - corner[1]) * units[1], last))
+        out[n, 2] = np.int64(min((np.int64(z[n]) - corner[2]) * units[2], last))
 
 
 @njit(cache=True, nogil=True)

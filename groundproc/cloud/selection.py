@@ -1,7 +1,7 @@
 """Which points are wanted: by time, by area, by flight line, by class; and how many each choice left out."""
 
-from collections.abc import MutableMapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, MutableMapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -156,7 +156,9 @@ class Selection:
             left = now
         return None if left == len(points) else wanted
 
-    def of(self, points: Points) -> Points:
-        """Those of some points that are wanted."""
+    def of(self, points: Points, columns: Collection[str] | None = None) -> Points:
+        """Those of some points that are wanted, with all columns or some of those they have."""
         wanted = self.mask(points)
+        if columns is not None:
+            points = replace(points, columns={name: points[name] for name in columns if name in points})
         return points if wanted is None else points.masked(wanted)

@@ -8,7 +8,7 @@ from groundproc.cloud.points import Points
 from groundproc.cloud.selection import SURFACES, Selection
 from groundproc.products.product import Context
 from groundproc.raster.grid import SMALLEST_CELL_M
-from groundproc.raster.kinds import CELL_M, gathering, kind
+from groundproc.raster.kinds import CELL_M, gathering, kind, needed
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,13 @@ class RasterProduct:
         """Begin with no points."""
         self._crs, self._path = context.crs, context.aside(self.FILE)
         chosen = kind(self.KIND, getattr(self._options, "statistic", None))
+        self._needed = needed(chosen)
         self._gathering = gathering(chosen, self._options.cell_m, context.folder)
         self._selection = Selection(() if self._options.all_classes else (SURFACES,))
 
     def add(self, points: Points) -> None:
         """Take points."""
-        self._gathering.add(self._selection.of(points))
+        self._gathering.add(self._selection.of(points, self._needed))
 
     def finish(self) -> None:
         """Write the file."""

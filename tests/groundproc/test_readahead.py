@@ -5,7 +5,14 @@ from collections.abc import Iterator
 
 import pytest
 
+from groundproc import readahead, system
 from groundproc.readahead import ahead
+
+
+@pytest.fixture(autouse=True)
+def several_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever the tests run."""
+    monkeypatch.setattr(readahead, "cores", lambda: 2)
 
 
 def test_items_come_in_their_order() -> None:
@@ -72,3 +79,28 @@ def test_streams_that_share_a_lock_are_made_one_at_a_time() -> None:
 
     pairs = zip(ahead(guarded(), lock), ahead(guarded(), lock), strict=True)
     assert all(a and b for a, b in pairs)
+
+
+def test_on_one_core_there_is_no_other_thread_and_what_is_left_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readahead, "cores", lambda: 1)
+    closed: list[bool] = []
+
+    def named() -> Iterator[str]:
+        try:
+            while True:
+                yield threading.current_thread().name
+        finally:
+            closed.append(True)
+
+    stream = ahead(named())
+    assert next(stream) == threading.current_thread().name
+    stream.close()
+    assert closed == [True]
+
+
+def test_threads_are_as_many_as_was_told_and_no_more_than_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(system.THREADS, raising=False)
+    there = system.cores()
+    for told, given in (("1", 1), ("100000", there), ("0", there), ("many", there)):
+        monkeypatch.setenv(system.THREADS, told)
+        assert system.cores() == given, told
