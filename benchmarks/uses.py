@@ -126,19 +126,22 @@ def strips() -> Figures:
 
 def change() -> Figures:
     """Boxes on waves of ground between shrubs that sway by 10 cm, 14 x 14 m, four times."""
-    from groundproc.analysis.changedetection import Rule, Side, compare, model
+    from groundproc.analysis.changebeams import Side
+    from groundproc.analysis.changedetection import compare
+    from groundproc.analysis.changemodel import Rule, model
+    from groundproc.analysis.registration import Registration
 
     side, per_m2, hits, boxes, false = 14.0, 1000.0, 0, 0, 0
-    rule = Rule(0.1, 0.25, 0.01, per_m2)
+    known = Registration(np.eye(4), np.zeros(3), np.diag([1e-4] * 3 + [1e-8] * 3), 0.01, 1.0, 1.0)
+    rule = Rule(0.1, 0.25, known, per_m2)
     for seed in range(4):
         rng = np.random.default_rng(seed)
         shrubs = [(*rng.uniform(1, side - 1, 2), rng.uniform(0.3, 0.8)) for _ in range(6)]
         places = rng.uniform(1, side - 1, (20, 2))
         places = np.array([p for p in places if all(np.hypot(p[0] - x, p[1] - y) > r + 0.4 for x, y, r in shrubs)])
         a, b = (_epoch(rng, each, shrubs, side, per_m2) for each in (places[:0], places))
-        at_a, at_b = model(a, rule), model(b, rule)
-        side_a, side_b = Side(a, np.zeros_like(a)), Side(b, np.zeros_like(b))
-        new, gone = compare(side_b, at_a, side_a, rule).claims, compare(side_a, at_b, side_b, rule).claims
+        at_a, at_b = (model(Side(each, np.zeros_like(each)), rule) for each in (a, b))
+        new, gone = compare(at_b, at_a, rule).claims, compare(at_a, at_b, rule).claims
         claimed = np.array([claim.place_m[:2] for claim in new]).reshape(-1, 2)
         apart = np.linalg.norm(claimed[:, None] - places[None], axis=2)
         hits += int((apart.min(axis=0, initial=np.inf) < 0.15).sum())

@@ -2,7 +2,7 @@
 
 import json
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +13,9 @@ import shapely
 
 from flightlog.errors import UsageError
 from groundproc.analysis import changedetection as detection
-from groundproc.analysis.changedetection import Claim, Rule, Side
+from groundproc.analysis.changebeams import Side
+from groundproc.analysis.changedetection import Claim
+from groundproc.analysis.changemodel import Rule, model
 from groundproc.analysis.deformation import surface as surfaces
 from groundproc.analysis.deformation.surface import Task as SurfaceTask
 from groundproc.analysis.epochs import Epochs, Progress, agreed_crs, laid
@@ -94,9 +96,9 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
         seen = (recovered(clouds[0]), recovered(clouds[1]))
         paths = seen if None not in seen else paths
     epochs = laid(clouds, paths, task.registered, progress)
-    per_m2, sigma_m = epochs.per_m2, epochs.registration.sigma_m
+    per_m2 = epochs.per_m2
     edge = task.voxel_m or float(np.clip(_PER_EDGE / np.sqrt(per_m2), _SMALLEST_M, _LARGEST_M))
-    rule = Rule(edge, task.sway_m if task.sway_m is not None else max(0.25, 2.0 * edge), sigma_m, per_m2)
+    rule = Rule(edge, task.sway_m if task.sway_m is not None else max(0.25, 2.0 * edge), epochs.registration, per_m2)
     with made_folder(task.folder):
         found, claims = _compare(task, epochs, rule, progress)
         told = _told(epochs, rule, claims)
@@ -129,12 +131,13 @@ def _compare(task: Task, epochs: Epochs, rule: Rule, progress: Progress) -> tupl
     for tile in tiles:
         origin = np.floor(tile.xyz_m.min(axis=0))
         way = np.stack([tile.columns[name] for name in ("east", "north", "up")], axis=1).astype(np.float64)
+        local = replace(rule, registration=epochs.registration.seen_from(origin))
         rows = [np.flatnonzero(tile.columns["epoch"] == number) for number in range(2)]
         sides = [Side(tile.xyz_m[own] - origin, way[own]) for own in rows]
-        models = [detection.model(each.xyz, rule) for each in sides]
+        models = [model(each, local) for each in sides]
         for number in (1, 0):
             own, other = rows[number], 1 - number
-            compared = detection.compare(sides[number], models[other], sides[other], rule)
+            compared = detection.compare(models[number], models[other], local)
             state = np.where((compared.state == detection.APPEARED) & (number == 0), detection.VANISHED, compared.state)
             core = tile.core[own]
             found.put(

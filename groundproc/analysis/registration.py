@@ -2,21 +2,24 @@
 
 Both clouds are smoothed: their points are put on the plane of the patch around (`numerics.normals`). Those of B are held against the planes
 of those of A that they are next to (Chen and Medioni 1992), from far to near, with weights by Cauchy, so that what has changed does not
-pull. Planes cut off crests and fill hollows; as both are smoothed alike that does not pull either. The covariance is of groups of residuals
-within four metres, which share their patches. A direction that no plane tells stays as it was.
+pull, and by how well patches of their roughness repeat: leaves sway. Planes cut off crests and fill hollows; as both are smoothed alike
+that does not pull either. The covariance is of groups of residuals within four metres, which share their patches, each judged by all
+others, for one bush may tell all there is of a direction. What normals tell by their own errors is no information. A direction that no
+plane tells stays as it was.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from flightlog.errors import CoverageError
 from groundproc.numerics.normals import normals
-from groundproc.numerics.robust import cauchy, sigma
+from groundproc.numerics.robust import MAD_TO_SIGMA, cauchy, sigma
 
 Array = npt.NDArray[np.float64]
 
@@ -32,6 +35,12 @@ _LEAST_FIT: Final = 0.5
 """Share of the points next to A that have to lie on it in the end."""
 _ON_M: Final = 0.05
 _GROUP_M: Final = 4.0
+_SETTLED: Final = 2
+"""Stages at the end in which it is known what is told."""
+_FEWEST_ALIKE: Final = 50
+"""Points of like roughness of which a scatter is told."""
+_MORE: Final = 1.5
+"""A direction has to be told so many times better than by the prior, and than normals tell it by their errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +74,16 @@ class Registration:
         shift = self.matrix[:3, 3] + turn @ self.about_m - self.about_m
         return np.asarray((xyz_m - self.about_m) @ turn.T + shift + self.about_m)
 
-    @property
-    def sigma_m(self) -> float:
-        """Of a shift, the mean of three axes, without directions that nothing tells."""
-        found = np.sqrt(np.diag(self.covariance)[:3])
-        told = found < 0.5 * _PRIOR[:3]
-        return float(found[told].mean()) if told.any() else float(found.mean())
+    def sigma_along_m(self, xyz_m: Array, normal: Array) -> Array:
+        """How well it is known along a direction at places in the frame of A, both of shape (n, 3)."""
+        rows = np.concatenate([normal, np.cross(xyz_m - self.about_m, normal)], axis=1)
+        return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", rows, self.covariance, rows)))
+
+    def seen_from(self, origin_m: Array) -> "Registration":
+        """The same, where coordinates are counted from another origin."""
+        matrix = self.matrix.copy()
+        matrix[:3, 3] += self.matrix[:3, :3] @ origin_m - origin_m
+        return replace(self, matrix=matrix, about_m=self.about_m - origin_m)
 
 
 def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registration:
@@ -108,7 +121,9 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
                 )
         if near.sum() < _FEWEST:
             break
-        step_m, covariance, residual_m = _adjust(surface, moved[near], nearest[near], reach, matrix)
+        some = other.some(np.flatnonzero(near) * step)
+        settled = number >= len(_STAGES_M) - _SETTLED
+        step_m, covariance, residual_m = _adjust(surface, some, moved[near], nearest[near], matrix, settled)
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = Rotation.from_rotvec(step_m[3:]).as_matrix(), step_m[:3]
         matrix = change @ matrix
@@ -140,33 +155,100 @@ class _Surface:
     normal: Array
     rough: Array
 
+    def some(self, rows: npt.NDArray[Any]) -> "_Surface":
+        """Places and planes of some of its points."""
+        return _Surface(None, self.xyz[rows], self.normal[rows], self.rough[rows])
+
     def over(self, xyz: Array, nearest: npt.NDArray[Any]) -> Array:
         """Distance of points from the planes at points of A."""
         return np.asarray(np.einsum("ni,ni->n", self.normal[nearest], xyz - self.xyz[nearest]))
 
 
 def _adjust(
-    surface: _Surface, moved: Array, nearest: npt.NDArray[Any], reach: float, matrix: Array
+    surface: _Surface, other: _Surface, moved: Array, nearest: npt.NDArray[Any], matrix: Array, settled: bool
 ) -> tuple[Array, Array, float]:
-    """One step of shift and turn, its covariance, and the scatter that is left."""
+    """One step of shift and turn, its covariance, and what scatter is left; in the end back to the start where nothing tells."""
     normal = surface.normal[nearest]
     over = surface.over(moved, nearest)
-    rows = np.concatenate([normal, np.cross(moved, normal)], axis=1)
-    scale = max(sigma(over), 1e-4)
+    # one unit for all six: what the prior is wide
+    rows = np.concatenate([normal, np.cross(moved, normal)], axis=1) * _PRIOR
+    rough = np.hypot(other.rough, surface.rough[nearest])
+    scale = _scales(over, rough)
     weight = cauchy(over / (2.0 * scale)) / scale**2
+    hessian = (rows * weight[:, None]).T @ rows
+    noise = _leaning(rows, weight, moved, other.normal @ matrix[:3, :3].T)
+    told, untold = _told(hessian, noise) if settled else (np.eye(6), np.empty((6, 0)))
     # what is told already by the prior: how far the whole has gone from where B said it was
-    gone = np.concatenate([matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_rotvec()])
-    hessian = (rows * weight[:, None]).T @ rows + np.diag(_PRIOR**-2)
-    right = -(rows * weight[:, None]).T @ over - gone / _PRIOR**2
-    step = np.linalg.solve(hessian, right)
+    gone = np.concatenate([matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_rotvec()]) / _PRIOR
+    right = -(rows * weight[:, None]).T @ over - gone
+    step = told @ np.linalg.solve(told.T @ (hessian + np.eye(6)) @ told, told.T @ right)
+    step -= untold @ np.linalg.solve(untold.T @ untold, untold.T @ (gone + step))
     left = over + rows @ step
-    cell = np.floor(moved / _GROUP_M).astype(np.int64)
-    _, group = np.unique(cell, axis=0, return_inverse=True)
+    _, group = np.unique(np.floor(moved / _GROUP_M).astype(np.int64), axis=0, return_inverse=True)
+    group = group.ravel()
+    inverse = told @ np.linalg.solve(told.T @ (hessian - noise + np.eye(6)) @ told, told.T)
+    covariance = inverse @ (_scatter(rows, weight, left, group) + np.eye(6)) @ inverse
+    covariance += _split(rows, scale, left, told, group)
+    covariance += untold @ np.linalg.solve(untold.T @ untold, untold.T)
+    return step * _PRIOR, covariance * np.outer(_PRIOR, _PRIOR), sigma(left)
+
+
+def _scales(over: Array, rough: Array) -> Array:
+    """What distances of points scatter by, as patches are rough: smooth ones repeat, leaves do not."""
+    octave = np.floor(2.0 * np.log2(rough)).astype(np.int64)
+    _, number = np.unique(octave, return_inverse=True)
+    number = number.ravel()
+    least = np.maximum(0.02 * rough, 1e-4)
+    found = np.empty(len(over))
+    for each in range(int(number.max()) + 1):
+        own = number == each
+        found[own] = sigma(over[own]) if own.sum() >= _FEWEST_ALIKE else np.inf
+    return np.maximum(np.where(np.isfinite(found), found, np.maximum(rough, sigma(over))), least)
+
+
+def _leaning(rows: Array, weight: Array, moved: Array, normal: Array) -> Array:
+    """What leaning normals seem to tell, though they do not: that which the other cloud's normals at the same places do not say as well."""
+    others = np.concatenate([normal, np.cross(moved, normal)], axis=1) * _PRIOR
+    others *= np.sign(np.einsum("ni,ni->n", rows[:, :3], normal))[:, None]
+    crossed = rows.T @ ((rows - others) * weight[:, None])
+    value, axis = np.linalg.eigh(0.5 * (crossed + crossed.T))
+    return np.asarray((axis * np.maximum(value, 0.0)) @ axis.T)
+
+
+def _told(hessian: Array, noise: Array) -> tuple[Array, Array]:
+    """Directions that are told by more than the prior and the lean of normals, shape (6, k), and the others, shape (6, 6 - k)."""
+    value, direction = eigh(hessian + np.eye(6), noise + np.eye(6))
+    return direction[:, value > _MORE], direction[:, value <= _MORE]
+
+
+def _scatter(rows: Array, weight: Array, left: Array, group: npt.NDArray[Any]) -> Array:
+    """Second moments of the groups' sums of residuals, each by a solution without it (a jackknife: Efron and Stein 1981)."""
     score = rows * (weight * left)[:, None]
-    sums = np.stack([np.bincount(group.ravel(), score[:, k]) for k in range(6)], axis=1)
-    inverse = np.linalg.inv(hessian)
-    covariance = inverse @ (sums.T @ sums + np.diag(_PRIOR**-2)) @ inverse
-    return step, covariance, sigma(left)
+    sums = np.stack([np.bincount(group, score[:, k]) for k in range(6)], axis=1)
+    own = np.empty((len(sums), 6, 6))
+    for i in range(6):
+        for j in range(6):
+            own[:, i, j] = np.bincount(group, weight * rows[:, i] * rows[:, j])
+    # of the prior there is always some left
+    whole = own.sum(axis=0) + np.eye(6)
+    without = np.linalg.solve(whole - own, sums[:, :, None])[:, :, 0] @ whole
+    return np.asarray(without.T @ without)
+
+
+def _split(rows: Array, scale: Array, left: Array, told: Array, group: npt.NDArray[Any]) -> Array:
+    """Covariance by how far the groups that tell of a direction disagree about it, those without weight too.
+
+    Where half of them contradict the rest, as bushes do that lean each its own way, robust weights choose some that agree by chance.
+    """
+    out = np.zeros((6, 6))
+    for direction in told.T:
+        along = rows @ direction / scale
+        own = np.bincount(group, along**2)
+        asked = np.abs(np.bincount(group, along * left / scale)) / np.maximum(own, 1e-12)
+        order = np.argsort(asked)
+        middle = MAD_TO_SIGMA * asked[order[np.searchsorted(np.cumsum(own[order]), 0.5 * own.sum())]]
+        out += np.outer(direction, direction) * middle**2 * (own**2).sum() / own.sum() ** 2
+    return out
 
 
 def _fit(surface: _Surface, moved: Array) -> float:
