@@ -26,6 +26,8 @@ VANISHED: Final = 2
 UNSEEN: Final = 3
 HALO_M: Final = 5.0
 """How far around a square others may decide on a point, and how large a change may be to be told as one."""
+_MISSED: Final = 2.5
+"""Points that the other epoch has to have missed."""
 _MOST_EACH: Final = 3.0
 """Beams that count for one point: a stop over one place must not outweigh all else of a change."""
 _AROUND_M: Final = 1.0
@@ -92,7 +94,7 @@ def compare(own: Model, other: Model, rule: Rule) -> Compared:
         for cluster, missed, looked in zip(
             found, np.split(expected, ends[:-1]), np.split(seen, ends[:-1]), strict=True
         ):
-            if np.mean(looked) < 0.5 or missed.sum() < FEWEST:
+            if np.mean(looked) < 0.5 or missed.sum() < _MISSED:
                 state[cluster] = UNSEEN
                 continue
             state[cluster] = APPEARED

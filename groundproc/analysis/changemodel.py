@@ -21,7 +21,7 @@ Mask = npt.NDArray[np.bool_]
 
 EDGES_M: Final = (0.15, 0.3, 0.6, 1.2)
 FEWEST: Final = 3
-"""Points of a claim, and points that the other epoch has to have missed."""
+"""Points of a claim."""
 _SHARE: Final = 0.2
 """Of the points that the top of a voxel has."""
 CHANCE: Final = 0.1

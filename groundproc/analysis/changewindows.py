@@ -60,7 +60,8 @@ def together(points: Apart, surface: Apart, edge_m: float, chance: float) -> npt
     own = _keys(points, rows, edge_m)
     cells, of_point = np.unique(own, return_inverse=True)
     of_point = of_point.ravel()
-    value = np.clip(points.sigmas[rows], -_MOST, _MOST)
+    # a shift that all have is of the registration
+    value = np.clip(points.sigmas[rows] - np.median(points.sigmas[rows]), -_MOST, _MOST)
     number, mean = _windows(cells, np.bincount(of_point).astype(np.float64), np.bincount(of_point, value))
     there = np.flatnonzero(np.isfinite(surface.sigmas))
     at = np.searchsorted(cells, keys := _keys(surface, there, edge_m)).clip(0, len(cells) - 1)

@@ -74,6 +74,13 @@ class Registration:
         shift = self.matrix[:3, 3] + turn @ self.about_m - self.about_m
         return np.asarray((xyz_m - self.about_m) @ turn.T + shift + self.about_m)
 
+    @property
+    def sigma_m(self) -> float:
+        """Of a shift, the mean of three axes, without directions that nothing tells."""
+        found = np.sqrt(np.diag(self.covariance)[:3])
+        told = found < 0.5 * _PRIOR[:3]
+        return float(found[told].mean()) if told.any() else float(found.mean())
+
     def sigma_along_m(self, xyz_m: Array, normal: Array) -> Array:
         """How well it is known along a direction at places in the frame of A, both of shape (n, 3)."""
         rows = np.concatenate([normal, np.cross(xyz_m - self.about_m, normal)], axis=1)
