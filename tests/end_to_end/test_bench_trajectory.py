@@ -73,6 +73,31 @@ def test_a_method_that_fails_says_why_and_the_others_go_on(judged_flight: Any, t
     assert "flight.mcap" in figures["error"]
 
 
+def test_a_flight_over_a_meadow_follows_with_the_same_methods(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    import trajectory
+
+    flown: list[tuple[str, Path]] = []
+
+    def measure(arguments: Any, folder: Path) -> dict[str, dict[str, Any]]:
+        flown.append((arguments.flight, arguments.out))
+        return {
+            "ins": {"ate_m": 1.0},
+            "kiss_icp": {"error": "lost"} if arguments.flight == "meadow" else {"ate_m": 9.0},
+        }
+
+    monkeypatch.setattr(trajectory, "measure", measure)
+    assert trajectory.main(["--out", str(tmp_path)]) == 0  # a peer that fails is no failure of ours
+    assert flown == [("survey_fast_gyro", tmp_path), ("meadow", tmp_path / "meadow")]
+    line = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(line["ins"]) == KEYS | {"meadow"}
+    assert set(line["ins"]["meadow"]) == KEYS
+    assert line["kiss_icp"]["meadow"]["error"] == "lost"
+    assert trajectory.main(["--out", str(tmp_path), "--no-meadow"]) == 0
+    assert len(flown) == 3
+
+
 def test_every_method_of_the_command_line_takes_part() -> None:
     from trajectory import own_methods
 
