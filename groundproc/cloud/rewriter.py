@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -9,6 +10,7 @@ from typing import Any, Final, Self
 import laspy
 import numpy as np
 import numpy.typing as npt
+import pyproj
 
 from flightlog.errors import CaptureError, SourceError
 from groundproc.cloud.dimensions import Dimension, in_order
@@ -20,6 +22,23 @@ Array = npt.NDArray[np.float64]
 
 _INT32: Final = np.iinfo(np.int32)
 _NOT_KEPT: Final = ("copc",)
+_PROJECTION: Final = "LASF_Projection"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Other coordinates.
+
+    Attributes
+    ----------
+    crs : pyproj.CRS or None
+        None: the file states none.
+    scale, offset : ndarray, shape (3,)
+    """
+
+    crs: pyproj.CRS | None
+    scale: Array
+    offset: Array
 
 
 class Rewriter:
@@ -35,6 +54,8 @@ class Rewriter:
         LAZ; else LAS.
     added : iterable of str
         Attributes of the table that every `write` gives values of. Extra bytes of that name that the cloud had are replaced.
+    frame : Frame, optional
+        Other coordinates, for `write_at`; default: those of the cloud.
 
     Raises
     ------
@@ -44,7 +65,9 @@ class Rewriter:
         The new file cannot be written.
     """
 
-    def __init__(self, cloud: Cloud, path: Path, compressed: bool = True, added: Iterable[str] = ()) -> None:
+    def __init__(
+        self, cloud: Cloud, path: Path, compressed: bool = True, added: Iterable[str] = (), frame: Frame | None = None
+    ) -> None:
         self.path, self.name = path, cloud.path
         self._added = in_order(added)
         with opened(cloud.path) as reader:
@@ -60,6 +83,12 @@ class Rewriter:
             header.vlrs.extend(v for v in old.vlrs if v.user_id not in _NOT_KEPT and not _is_extra_bytes(v))
             if old.version.minor >= 4:
                 reader.read_evlrs()
+            if frame is not None:
+                header.scales, header.offsets = frame.scale, frame.offset
+                header.vlrs[:] = [v for v in header.vlrs if v.user_id != _PROJECTION]
+                if frame.crs is not None:
+                    header.add_crs(frame.crs, keep_compatibility=False)
+            self._scales, self._offsets = np.array(header.scales), np.array(header.offsets)
             self._evlrs = [v for v in (reader.evlrs or []) if v.user_id not in _NOT_KEPT]
         try:
             self._las = laspy.open(
@@ -113,6 +142,32 @@ class Rewriter:
         with storing(self.path):
             self._las.write_points(record)
         return places
+
+    def write_at(self, record: Any, places: Array) -> None:
+        """Append points at other coordinates, shape (n, 3), of the frame that was given.
+
+        Parameters
+        ----------
+        record : laspy.ScaleAwarePointRecord
+            As read; changed.
+        places : ndarray, shape (n, 3)
+
+        Raises
+        ------
+        CaptureError
+            A place lies beyond what the frame can hold.
+        """
+        stored = np.rint((places - self._offsets) / self._scales)
+        if len(stored) and not (np.abs(stored) <= _INT32.max).all():
+            raise CaptureError(
+                f"{self.name}: a point has no place within what its scale can hold, expected all near each other"
+            )
+        for axis, name in enumerate("XYZ"):
+            record[name] = stored[:, axis].astype(np.int32)
+        # as the header has them: else laspy would convert the whole numbers once more
+        record.scales, record.offsets = self._scales, self._offsets
+        with storing(self.path):
+            self._las.write_points(record)
 
     def _with_columns(self, record: Any, columns: Mapping[str, npt.NDArray[Any]]) -> Any:
         """The points with room for more, and that filled."""

@@ -20,7 +20,7 @@ READ_ON: Final = {
     "reflectance": "uses/reflectance.md", "replay": "tutorial.md", "report": "report.md", "section": "uses/section.md",
     "simulate": "simulator.md", "soil": "uses/soil.md",
     "tile": "clouds.md#tiles", "tin": "clouds.md#triangles-for-design-and-machine-control",
-    "trees": "uses/trees.md",
+    "transform": "transform.md", "trees": "uses/trees.md",
     "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",
     "warmup": "install.md#on-the-ground-compile-once", "mesh": "imagery.md", "wide": "imagery.md",
     "windows": "uses/windows.md",
