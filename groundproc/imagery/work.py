@@ -29,6 +29,8 @@ _SETTLED_S: Final = 5e-5
 """Shifts of clocks that change less than this need no new poses of the trajectory."""
 _MOST_ROUNDS: Final = 5
 _MOST_RMS_PX: Final = 3.0
+_FEW_POINTS: Final = 6
+"""An image with fewer is hardly placed by them."""
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:
@@ -184,7 +186,7 @@ def _finish(
     utc_ns = np.where(stamps == NO_TIME, NO_TIME, stamps + shift)
     told = results.figures(adjusted, session.site, measured.names, session.control) | more
     told |= _origins(session)
-    session.warnings += _doubts(told, session, measured)
+    session.warnings += doubts_of(told, session, measured)
     told["left_out"] = session.left_out
     told["warnings"] = session.warnings
     if session.pictures:
@@ -222,7 +224,7 @@ def _hand_back(task: Task, trajectory: Trajectory, adjusted: Adjusted) -> None:
     hybrid.write_gained(task.output / results.HYBRID, hybrid.thinned(poses, task.every_s), trajectory.frame)
 
 
-def _doubts(told: dict[str, Any], session: Session, measured: Measurements) -> list[str]:
+def doubts_of(told: dict[str, Any], session: Session, measured: Measurements) -> list[str]:
     """Sentences for who must know."""
     doubts = []
     if measured.strangers:
@@ -236,6 +238,16 @@ def _doubts(told: dict[str, Any], session: Session, measured: Measurements) -> l
             doubts.append(
                 f"{len(told['control'])} control points do not lay the block, expected three or more: {told['datum']}"
             )
+    few = [one["image"] for one in told["images"] if one["points"] < _FEW_POINTS]
+    if few and session.trajectory is not None:
+        doubts.append(
+            f"images with fewer than {_FEW_POINTS} points in common with others, placed by the trajectory alone: {names_listed(few)}"
+        )
+    if max(session.lasting.place, session.lasting.turn) >= max(lasting.SIZES):
+        doubts.append(
+            f"the trajectory departs from the block by {max(lasting.SIZES) ** 0.5:.0f} times its stated sigmas or more: is the camera "
+            "model, the clock or the trajectory the right one?"
+        )
     gross = told["counts"]["left_out"]["gross"]
     if gross:
         doubts.append(f"{gross} image points are gross errors and were left out")

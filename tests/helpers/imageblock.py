@@ -52,10 +52,13 @@ def true_camera(**changes: Any) -> RigCamera:
     return replace(RigCamera("cam0", camera, mat, -mat @ np.array([0.05, 0.12, -0.08]), 0.04), **changes)
 
 
-def fly(camera: RigCamera, strips: int = 4, per_strip: int = 6, seed: int = 0, points: int = 900) -> Flown:
-    """Strips there and back at two heights, images 60 % and 40 % over each other."""
+def fly(
+    camera: RigCamera, strips: int = 4, per_strip: int = 6, seed: int = 0, points: int = 900,
+    spacing_m: tuple[float, float] = (18.0, 32.0), height: float = 40.0,
+) -> Flown:  # fmt: skip
+    """Strips there and back at two heights, images over each other along and across as their spacing and height have it."""
     rng = np.random.default_rng(seed)
-    base, side, speed, height = 18.0, 32.0, 6.0, 40.0
+    (base, side), speed = spacing_m, 6.0
     length_s = per_strip * base / speed
     time_s = np.arange(0.0, strips * (length_s + 6.0), 0.01)
     leg = np.minimum(time_s // (length_s + 6.0), strips - 1).astype(int)
