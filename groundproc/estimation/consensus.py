@@ -25,6 +25,8 @@ POSITION_WHITE_M: Final = 0.1
 a tenth of a metre is new each second."""
 GATE_SIGMAS: Final = 5.0
 """A step may be off by so many of its sigmas."""
+EASY: Final = 0.36
+"""A step whose square is less of the gate's, three of five sigmas, is none that leads away."""
 LOOKED_BACK_S: Final = (4.0, 16.0)
 """From so long ago a step is looked at too."""
 LONGEST_S: Final = 600.0
@@ -120,6 +122,13 @@ def _longest(time_s: Array, off_m: Array, steps: Steps) -> Mask:
     while i >= 0:
         kept[i] = True
         i = int(previous[i])
+    # a second that the chain passed by for little, near both its neighbours, did not walk away
+    inside = np.flatnonzero(kept)
+    for i in np.flatnonzero(~kept):
+        after = int(np.searchsorted(inside, i))
+        if 0 < after < len(inside):
+            before, behind = int(inside[after - 1]), int(inside[after])
+            kept[i] = max(strain(i, np.array([before]))[0], strain(behind, np.array([i]))[0]) <= EASY
     return kept
 
 
