@@ -124,11 +124,11 @@ def _longest(time_s: Array, off_m: Array, steps: Steps) -> Mask:
         i = int(previous[i])
     # a second that the chain passed by for little, near both its neighbours, did not walk away
     inside = np.flatnonzero(kept)
-    for i in np.flatnonzero(~kept):
-        after = int(np.searchsorted(inside, i))
+    for left in np.flatnonzero(~kept).tolist():
+        after = int(np.searchsorted(inside, left))
         if 0 < after < len(inside):
-            before, behind = int(inside[after - 1]), int(inside[after])
-            kept[i] = max(strain(i, np.array([before]))[0], strain(behind, np.array([i]))[0]) <= EASY
+            to, on = strain(left, inside[[after - 1]]), strain(int(inside[after]), np.array([left]))
+            kept[left] = max(float(to[0]), float(on[0])) <= EASY
     return kept
 
 

@@ -1,0 +1,96 @@
+"""Whether errors of `adjusted` are those that its covariance allows, over flights, seeds and scenes.
+
+Errors of one flight hang together: where the whole lies and how it is turned is one draw a flight, and so a flight counts as one draw of
+so many degrees of freedom as it has components (mean of the normalised squared errors over its poses).
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import chi2
+
+from flightlog import frames
+from flightlog.logfile import LogReader
+from groundproc.accuracy.poses import PoseSeries, common_poses
+from groundproc.accuracy.truth import on_lidar_clock, read_truth
+from groundproc.estimation import methods
+from groundproc.estimation.method import gather
+from groundproc.flight.flight import read_flight
+from groundproc.flight.pairing import legs
+from groundproc.survey import Survey
+from groundproc.trajectory.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+BLOCKS = {"position": slice(0, 3), "attitude": slice(3, 6), "both": slice(0, 6)}
+EVERY = 10
+"""Poses of which one is looked at: each tenth of a second."""
+SOAK = [(scene, seed) for seed in range(101, 105) for scene in ("survey_fast_gyro", "meadow", "slope")]
+
+
+def errors(estimated: PoseSeries, true: PoseSeries) -> Array:
+    """East, north, up [m], roll, pitch, heading [rad] off, shape (n, 6)."""
+    heading, pitch, roll = frames.attitude_of(estimated.mat_local_body)
+    truly = frames.attitude_of(true.mat_local_body)
+    turned = np.stack([roll - truly[2], pitch - truly[1], heading - truly[0]], axis=1)
+    return np.column_stack([estimated.position_m - true.position_m, (turned + np.pi) % (2.0 * np.pi) - np.pi])
+
+
+def normalised(trajectory: Trajectory, true: Trajectory) -> dict[str, float]:
+    """Mean of the normalised squared errors, by block; and by `within` the share of all errors within two sigma."""
+    series = common_poses(trajectory, true)[:2]
+    off = errors(*series)[::EVERY]
+    covariance = trajectory.covariance_at(series[0].time_ns[::EVERY])
+    found = {}
+    for name, part in BLOCKS.items():
+        own = covariance[:, part, part]
+        found[name] = float(
+            np.einsum("ni,ni->n", off[:, part], np.linalg.solve(own, off[:, part, None])[..., 0]).mean()
+        )
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return found | {"within": float((np.abs(off) < 2.0 * sigma).mean())}
+
+
+def flown(folder: Path) -> dict[str, float]:
+    truth = read_truth(folder)
+    with LogReader(truth.log) as reader:
+        read = read_flight([reader], "ins")
+        timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+        given = gather([reader], read, timeline, truth.nominal_mount, Survey(method="adjusted"))
+        made = methods.estimate(given, lambda stage, size: None)
+    return normalised(on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth), truth.trajectory)
+
+
+def covers(found: list[dict[str, float]], *, loose: bool) -> None:
+    """Sums over flights lie within what 1 and 999 of a thousand such sums do; `loose`: nothing is asked of the lower end."""
+    for name, part in BLOCKS.items():
+        freedom = len(found) * (part.stop - part.start)
+        total = sum(each[name] for each in found)
+        assert total < chi2.ppf(0.999, freedom), (name, [each[name] for each in found])
+        assert loose or total > chi2.ppf(0.001, freedom), (name, [each[name] for each in found])
+
+
+def test_over_a_house_and_a_meadow_the_covariance_covers_the_errors(simulated: Callable[..., Any]) -> None:
+    from simulator.plans import plan
+
+    house = simulated("adjusted_flight", "village", 20.0, plan("survey_fast_gyro").options, seed=11, points=True)
+    meadow = simulated("adjusted_meadow", "meadow", 16.0, plan("meadow").options, seed=31)
+    found = [flown(each.folder) for each in (house, meadow)]
+    covers(found, loose=True)
+    assert np.mean([each["within"] for each in found]) >= 0.9
+
+
+@pytest.mark.soak
+def test_over_many_seeds_and_scenes_the_covariance_is_that_of_the_errors(simulated: Callable[..., Any]) -> None:
+    from simulator.plans import plan
+
+    found = []
+    for name, seed in SOAK:
+        flight = plan(name)
+        found.append(flown(simulated(f"coverage_{name}_{seed}", flight.scene, 14.0, flight.options, seed=seed).folder))
+    covers(found, loose=False)
+    assert np.mean([each["within"] for each in found]) >= 0.95
