@@ -33,6 +33,8 @@ THINNED_HZ: Final = {"fixes": 10.0, "attitude": 25.0, "baro": 5.0}
 """Stated values that come faster are thinned out: their errors are the same ones."""
 LONGEST_FIX_GAP_NS: Final = 1_500_000_000
 """Silence of the receiver from which the autopilot's position is dead reckoning."""
+LONGEST_WITHOUT_FIX_NS: Final = 60 * NS_PER_S
+"""So long before the first fix, and behind the last, inertial sensors carry the position: as long as they bridge an outage."""
 RECOVERY_S: Final = 10.0
 """How long after an outage an autopilot's position is still on its way back to the fixes."""
 UNKNOWN_RATE_DENSITY: Final = np.deg2rad(5.0) ** 2 * 0.2
@@ -101,8 +103,12 @@ def read(
     del source
     attitude_utc, fix_utc = utc_from_boot(attitude_ns), utc_from_boot(fixes.time_ns)
     step_ns = FAST_STEP_NS if lidar is not None else STEP_NS
-    start_ns = -(-max(int(attitude_utc[0]), int(fix_utc[0])) // STEP_NS) * STEP_NS
-    end_ns = min(int(attitude_utc[-1]), int(fix_utc[-1]))
+    first_ns, last_ns = int(fix_utc[0]), int(fix_utc[-1])
+    if lidar is not None or autopilot_force(boot) is not None:
+        # the first fix came late, or the last one early: what flew before and after is told by inertial sensors
+        first_ns, last_ns = _widened(first_ns, int(attitude_utc[0]), -1), _widened(last_ns, int(attitude_utc[-1]), 1)
+    start_ns = -(-max(int(attitude_utc[0]), first_ns) // STEP_NS) * STEP_NS
+    end_ns = min(int(attitude_utc[-1]), last_ns)
     if end_ns - start_ns < 2 * STEP_NS:
         raise LogError("MAVLink: positions and attitudes of the autopilot do not overlap in time")
     nodes_s: Array = np.arange(0, end_ns - start_ns + 1, step_ns).astype(np.float64) * 1e-9
@@ -153,6 +159,12 @@ def read(
         gyro,
         force,
     )
+
+
+def _widened(fix_ns: int, attitude_ns: int, side: int) -> int:
+    """The end of the fixes, or that of the attitudes where these go on for longer than a silence between fixes, within reason."""
+    beyond = side * (attitude_ns - fix_ns)
+    return fix_ns if beyond <= LONGEST_FIX_GAP_NS else fix_ns + side * min(beyond, LONGEST_WITHOUT_FIX_NS)
 
 
 def _thinned(time_s: Array, rate_hz: float) -> Times:

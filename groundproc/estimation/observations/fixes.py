@@ -361,7 +361,9 @@ def measured(boot: Boot, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
     row = np.clip(np.searchsorted(gps_ns, time_ns, side="right") - 1, 0, len(gps_ns) - 1)
     # a message late: between the last with a fix and the first without, it may be lost already
     good = fixed[row] & fixed[np.minimum(row + 1, len(fixed) - 1)]
-    for regained_ns in gps_ns[1:][fixed[1:] & ~fixed[:-1]].tolist():
+    # the first fix of a flight is none that came back: nothing had drifted away before
+    before = np.maximum.accumulate(fixed)
+    for regained_ns in gps_ns[1:][fixed[1:] & ~fixed[:-1] & before[:-1]].tolist():
         good &= (time_ns < regained_ns) | (time_ns > regained_ns + RECOVERY_NS)
     return np.asarray(good if good.sum() >= 2 else np.ones(len(time_ns), np.bool_))
 

@@ -297,6 +297,17 @@ def test_an_outage_of_gps_is_bridged_and_said(simulated: Any) -> None:
     assert (np.abs(flown.filtered.position[gap]) < 2.0 * flown.filtered.sigma_position[gap]).mean() > 0.9
 
 
+def test_what_is_flown_before_the_first_fix_is_told_by_inertial_sensors(simulated: Any) -> None:
+    flight = simulated("filtered_late", "village", 40.0, options(faults={"gnss_from_s": 12.0}), seed=3, every=10_000)
+    flown = fly(flight)
+    assert flown.ins.covered < 0.75
+    assert flown.filtered.covered > 0.98
+    early = flown.filtered.time_s < 10.0
+    assert (np.abs(flown.filtered.position[early]) < 3.0 * flown.filtered.sigma_position[early]).all()
+    assert (np.abs(flown.filtered.attitude[early]) < 3.0 * flown.filtered.sigma_attitude[early]).all()
+    assert (flown.filtered.sigma_position[0, :2] > flown.filtered.sigma_position[:, :2].min(axis=0)).all()
+
+
 def outside(flown: Flown, frame: LocalFrame, lever_m: Array, every_s: float, sigma_m: float) -> OutsideFixes:
     """True positions of a point of the airframe with white noise, as a better receiver would state them."""
     step = round(every_s * 500)
