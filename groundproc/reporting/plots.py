@@ -108,14 +108,20 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
     if len(x) <= 2 * _COLUMNS:
         return x, y
     edges = np.linspace(0, len(x), _COLUMNS + 1).astype(int)
-    chosen: list[int] = []
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        some = y[begin:end]
-        if np.isfinite(some).any():
-            chosen += sorted({begin + int(np.nanargmin(some)), begin + int(np.nanargmax(some))})
-        else:
-            chosen.append(begin)
+    starts, counts = edges[:-1], np.diff(edges)
+    known = np.logical_or.reduceat(np.isfinite(y), starts)
+    extremes = [
+        _first(y == np.repeat(of.reduceat(y, starts), counts), starts)[known]
+        for of in (np.fmin, np.fmax)  # they pass by what is no number
+    ]
+    chosen = np.unique(np.concatenate([*extremes, starts[~known]]))
     return x[chosen], y[chosen]
+
+
+def _first(where: npt.NDArray[np.bool_], starts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The first place of a mask from each start on; the mask's length where there is none."""
+    places = np.append(np.flatnonzero(where), len(where))
+    return np.asarray(places[np.searchsorted(places, starts)])
 
 
 def ticks(low: float, high: float, most: int = 6) -> list[float]:

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import itertools
 import re
 
 import numpy as np
@@ -10,6 +11,25 @@ from PIL import Image
 
 from groundproc.reporting.maps import coloured, lit, of_points, palette, png, scale_m, span
 from groundproc.reporting.plots import Curve, Plot, draw, thinned, ticks
+
+
+def test_a_thinned_curve_is_the_extremes_of_each_column_with_gaps_where_nothing_is_known() -> None:
+    rng = np.random.default_rng(3)
+    for count in (1201, 7333):
+        y = np.round(rng.normal(0.0, 3.0, count))  # many are alike: the first one counts
+        y[rng.random(count) < 0.4] = np.nan
+        y[:40] = y[-40:] = np.nan
+        y[100] = np.inf
+        expected: list[int] = []
+        edges = np.linspace(0, count, 601).astype(int)
+        for begin, end in itertools.pairwise(edges.tolist()):
+            known = [n for n in range(begin, end) if not np.isnan(y[n])]
+            if any(np.isfinite(y[n]) for n in known):
+                expected += sorted({min(known, key=y.__getitem__), max(known, key=y.__getitem__)})
+            else:
+                expected.append(begin)
+        found, _ = thinned(np.arange(count, dtype=float), y)
+        assert found.astype(int).tolist() == expected
 
 
 def test_a_thinned_curve_keeps_every_peak() -> None:
