@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Fly made-up flights through the real stages; what is compiled already is only loaded."""
     from groundproc import kernelcache
+    from groundproc.imagery.painting import warmup as painting
     from groundproc.live.warmup import warm_up
     from groundproc.progress import compiling
 
@@ -41,6 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
             with tempfile.TemporaryDirectory(prefix="swath-warmup-") as folder:
                 _process(Path(folder), name == "dual", words)
         warm_up()
+        with tempfile.TemporaryDirectory(prefix="swath-warmup-") as folder:
+            painting.warm_up(Path(folder))
     took_s = time.monotonic() - begun_s
     done = f"{count} kernels compiled" if count else "everything was compiled before, and is looked through"
     print(f"{done} in {took_s:.0f} s; kept in {kernelcache.folder()}")

@@ -61,6 +61,16 @@ def radial(kind: int, lens: Array, q: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
+def _bent(lens: Array, x: float, y: float, sign: float) -> tuple[float, float]:
+    """Brown's distortion of (x, y) alone; `sign` as of `brown`."""
+    p, q = (lens[6], lens[7]) if sign > 0.0 else (lens[7], lens[6])
+    s = x * x + y * y
+    factor = 1.0 + s * (lens[4] + s * (lens[5] + s * lens[8]))
+    across = x * factor + 2.0 * p * x * y + q * (s + 2.0 * x * x)
+    return across, y * factor + p * (s + 2.0 * y * y) + 2.0 * q * x * y
+
+
+@njit(cache=True, nogil=True)
 def brown(lens: Array, x: float, y: float, sign: float, out: Array, jac: Array, jlens: Array) -> None:
     """Brown's distortion of (x, y), its Jacobian and its derivatives by the five coefficients.
 
@@ -71,8 +81,7 @@ def brown(lens: Array, x: float, y: float, sign: float, out: Array, jac: Array, 
     s = x * x + y * y
     factor = 1.0 + s * (k1 + s * (k2 + s * k3))
     slope = 2.0 * (k1 + s * (2.0 * k2 + s * 3.0 * k3))
-    out[0] = x * factor + 2.0 * p * x * y + q * (s + 2.0 * x * x)
-    out[1] = y * factor + p * (s + 2.0 * y * y) + 2.0 * q * x * y
+    out[0], out[1] = _bent(lens, x, y, sign)
     jac[0, 0] = factor + x * x * slope + 2.0 * p * y + 6.0 * q * x
     jac[0, 1] = x * y * slope + 2.0 * p * x + 2.0 * q * y
     jac[1, 0] = jac[0, 1]
@@ -200,6 +209,16 @@ def _undone(lens: Array, sign: float, x: float, y: float, out: Array) -> bool:
 @njit(cache=True, nogil=True)
 def projected(kind: int, lens: Array, ray: Array, out: Array) -> bool:
     """Pixel of a ray; False where the model does not reach."""
+    if kind == RADTAN:  # the usual one, for millions of points: without derivatives
+        if ray[2] <= 0.0:
+            return False
+        a, b = ray[0] / ray[2], ray[1] / ray[2]
+        if a * a + b * b > lens[FARTHEST] * lens[FARTHEST]:
+            return False
+        a, b = _bent(lens, a, b, 1.0)
+        out[0] = lens[FOCAL] * a + lens[SKEW] * b + lens[PU]
+        out[1] = lens[FOCAL] * lens[ASPECT] * b + lens[SKEW + 1] * a + lens[PV]
+        return True
     place, jac, unused = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 5))
     if not distorted(kind, lens, ray, place, jac, unused):
         return False

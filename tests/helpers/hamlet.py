@@ -435,3 +435,18 @@ def exposed(shots: Sequence[Shot], low: float, high: float, seed: int) -> list[S
     """The same with an exposure of its own each, and a white balance."""
     rng = np.random.default_rng(seed)
     return [replace(shot, exposure=tuple(rng.uniform(low, high) * rng.uniform(0.97, 1.03, 3))) for shot in shots]
+
+
+def clear_cut(
+    scene: Hamlet, shot: Shot, true: Array, spacing: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Points that are seen, and those that are hidden, wherever within a spacing across the view they may be."""
+    ways = [np.zeros(3), *(sign * spacing * shot.turn[:, axis] for axis in (0, 1) for sign in (1, -1))]
+    _, inside = shot.lens.pixels((true - shot.place) @ shot.turn)
+    hidden = []
+    for way in ways:
+        distance, _ = scene.hit(shot.place, true + way - shot.place)
+        # the surface itself leans away from a place beside the point
+        leans = 2.0 * spacing / np.linalg.norm(true - shot.place, axis=1) if way.any() else 1e-6
+        hidden.append(distance < 1.0 - leans)
+    return inside & ~np.any(hidden, axis=0), inside & np.all(hidden, axis=0)

@@ -50,19 +50,6 @@ def coloured(place: Path) -> tuple[laspy.LasData, Array, npt.NDArray[np.int64]]:
     return laspy.read(place / "out.laz"), truth["true"], truth["kind"]
 
 
-def clear_cut(shot: hamlet.Shot, true: Array) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Points that are seen, and those that are hidden, wherever within a spacing across the view they may be."""
-    ways = [np.zeros(3), *(sign * SPACING_M * shot.turn[:, axis] for axis in (0, 1) for sign in (1, -1))]
-    _, inside = shot.lens.pixels((true - shot.place) @ shot.turn)
-    hidden = []
-    for way in ways:
-        eye = np.broadcast_to(shot.place, true.shape)
-        distance, _ = SCENE.hit(eye, true + way - eye)
-        # the surface itself leans away from a place beside the point
-        hidden.append(distance < 1.0 - (1e-6 if not way.any() else 2.0 * SPACING_M / 30.0))
-    return inside & ~np.any(hidden, axis=0), inside & np.all(hidden, axis=0)
-
-
 def test_each_picture_colours_what_it_sees_and_nothing_behind_it(place: Path) -> None:
     """But for what lies within a spacing of an edge, as the camera sees it: there points do not say where it is."""
     truth = np.load(place / "truth.npz")
@@ -78,7 +65,7 @@ def test_each_picture_colours_what_it_sees_and_nothing_behind_it(place: Path) ->
             seen = np.zeros(cloud.points, bool)
             for square, those, _ in paint.visible(found, image, scene):
                 seen[scene.number[square.points][those.number]] = True
-            visible, hidden = clear_cut(shots[image.name], true)
+            visible, hidden = hamlet.clear_cut(SCENE, shots[image.name], true, SPACING_M)
             counts += [hidden.sum(), (hidden & seen[some]).sum(), visible.sum(), (visible & ~seen[some]).sum()]
     assert counts[0] > 10_000
     assert counts[1] < 0.001 * counts[0]
