@@ -14,7 +14,8 @@ CHAPTERS: Final = {
     "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse", "merge", "tile",
         "transform"),
     "what people fly for": (
-        "ground", "trees", "wires", "pipes", "windows", "detect", "soil", "change", "viewshed", "passability", "reflectance", "orthophoto",
+        "ground", "trees", "wires", "pipes", "windows", "detect", "moving", "soil", "change",
+        "viewshed", "passability", "reflectance", "orthophoto",
     ),
     "images": ("images", "colour", "ortho", "ndvi", "wide", "mesh", "drape"),
     "this computer": ("warmup", "completion"),

@@ -22,6 +22,7 @@ REGISTRY: Final[dict[str, Entry]] = {
         "groundproc.uses.windows", "make", "windows.laz: what is behind panes in class 68; walls.geojson"
     ),
     "detect": Entry("groundproc.uses.detect", "make", "objects.geojson: hard targets; penetration.tif: where nothing can be claimed"),
+    "moving": Entry("groundproc.uses.moving", "make", "moving.geojson, ways.geojson: what moved, with time, place and speed"),
     "soil": Entry("groundproc.uses.soil", "make", "soil.geojson: patches of ground that stand out by height and reflectance"),
     "passability": Entry(
         "groundproc.uses.passability", "make", "passability.tif, slope.tif, step.tif, obstacle.tif: where a vehicle can go"
