@@ -17,7 +17,9 @@ from typing import Any, Final
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "benchmarks.md"
 FIGURES: Final = ROOT / "docs" / "benchmarks.json"
-NO_BENCHMARKS: Final = ("all", "drawing", "imagery_painting", "long_log", "machine", "mutations", "uses_clouds")
+NO_BENCHMARKS: Final = (
+    "all", "drawing", "imagery_painting", "long_log", "machine", "mutations", "uses_clouds", "uses_ground",
+)  # fmt: skip
 """This one, what others use, and what measures the tests."""
 ON_DEMAND: Final = ("kit", "study", "windows")
 """What takes an hour and more, or root: measured where `--only` names it."""

@@ -11,6 +11,7 @@ change_detection_rate     share of boxes of 1 dm3 found, 1000 points/m2 amid swa
 change_false_per_100m2    claims that are none, there
 (those of uses_clouds.py)  ground, detection, wires, trees, buildings
 (those of uses_change.py)  what moved between two flights
+(those of uses_ground.py)  soil, moving things, panes, pipes, passability
 sight_exact_agreement     share of cells of 200 random surfaces where `exact` says what a dense walk along the line says
 sight_fast_agreement      share of cells of a terrain of a million cells where `fast` says what `exact` says
 sight_fast_ratio_to_gdal  CPU time of `fast` over that of GDAL, for it
@@ -33,10 +34,11 @@ import numpy as np
 import numpy.typing as npt
 import uses_change
 import uses_clouds
+import uses_ground
 from scipy.ndimage import gaussian_filter
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-sys.path += [str(ROOT / "tests" / "helpers")]
+sys.path += [str(ROOT), str(ROOT / "tests" / "helpers")]
 
 Array = npt.NDArray[np.float64]
 Figures = dict[str, Any]
@@ -259,6 +261,7 @@ FIGURES: Final[dict[str, Callable[[], Figures]]] = {
     "sight": sight,
     **uses_change.FIGURES,
     **uses_clouds.FIGURES,
+    **uses_ground.FIGURES,
 }
 
 if __name__ == "__main__":
