@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,9 @@ from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]
+
+_LEAST_KNOWN_M: Final = 0.5
+"""A larger sigma of the place is that of what was assumed, not of what was seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +80,27 @@ def fuse(
 def _laid(cloud: reader.Cloud, base: Array, sample: Array, what: str, searched: bool) -> Laid:
     """A cloud laid on a sample of the first by one of itself."""
     if not searched:
-        return Laid(cloud.path, cloud.points, register(base, sample, what))
+        return Laid(cloud.path, cloud.points, _certain(register(base, sample, what), what))
     place = search(base, sample, what)
-    fine = register(base, sample @ place.matrix[:3, :3].T + place.matrix[:3, 3], what)
+    fine = _certain(register(base, sample @ place.matrix[:3, :3].T + place.matrix[:3, 3], what), what)
     return Laid(cloud.path, cloud.points, replace(fine, matrix=fine.matrix @ place.matrix), place)
+
+
+def _certain(found: Registration, what: str) -> Registration:
+    """A registration, if it tells all of the place.
+
+    Raises
+    ------
+    CoverageError
+        They would fit as well, moved along some direction.
+    """
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]))
+    if sigma_m > _LEAST_KNOWN_M:
+        raise CoverageError(
+            f"{what}: fit as well moved along each other (a sigma of {sigma_m:.1f} m, expected below {_LEAST_KNOWN_M:g} m), for nothing "
+            "stands up or slopes where both are; --registered takes them as they lie"
+        )
+    return found
 
 
 def _sample(cloud: reader.Cloud, progress: Callable[[int], object]) -> Array:

@@ -35,7 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.commands.outputs import claim_file, write_json
 
     if not 2 <= len(arguments.clouds) <= 255:
-        raise UsageError(f"{len(arguments.clouds)} clouds given, expected 2 to 255")
+        given = "one cloud" if len(arguments.clouds) == 1 else f"{len(arguments.clouds)} clouds"
+        raise UsageError(f"{given} given, expected 2 to 255")
     if arguments.search and arguments.registered:
         raise UsageError("--search and --registered: both given, expected one of them")
     expect(arguments.clouds, CLOUD, CLOUD_WORDS)

@@ -45,10 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.files import removed, written_aside
 
     paths = [cloud_in(each) for each in arguments.clouds]
-    if len({path.resolve() for path in paths}) < max(len(paths), 2):
-        raise UsageError(
-            f"{len(paths)} clouds given, {len({p.resolve() for p in paths})} of them different; expected two or more, each once"
-        )
+    if len(paths) < 2:
+        raise UsageError(f"one cloud given, {paths[0]}; expected two or more")
+    again = [path for n, path in enumerate(paths) if path.resolve() in {each.resolve() for each in paths[:n]}]
+    if again:
+        raise UsageError(f"{again[0]}: given twice; expected each cloud once")
     expect(paths, CLOUD, CLOUD_WORDS)
     claim_file(arguments.output, (".laz",), arguments.force, paths)
     if arguments.json is not None:

@@ -94,6 +94,20 @@ def test_clouds_of_other_kinds_are_laid_on_the_first(tmp_path: Path, capsys: pyt
     assert not (tmp_path / "g.laz").exists()
 
 
+def test_what_fits_moved_along_itself_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Flat roofs on a plain without their walls: any shift puts plain on plain."""
+    rng = np.random.default_rng(6)
+    for name, shift in (("a", 0.0), ("b", 12.0)):
+        xyz = np.column_stack([rng.uniform(0, 40, (30_000, 2)), rng.normal(0, 0.01, 30_000)])
+        xyz[(np.abs(xyz[:, :2] - 15.0) < 4.0).all(axis=1), 2] += 4.0
+        write(tmp_path / f"{name}.laz", xyz + np.array([shift, 0.0, 0.0]))
+    assert main(["fuse", str(tmp_path / "a.laz"), str(tmp_path / "b.laz"), "-o", str(tmp_path / "f.laz")]) == 1
+    assert "fit as well moved along each other" in capsys.readouterr().err
+    assert not (tmp_path / "f.laz").exists()
+    assert main(["fuse", str(tmp_path / "a.laz"), "-o", str(tmp_path / "f.laz")]) == 2
+    assert "one cloud given" in capsys.readouterr().err
+
+
 def yard(rng: np.random.Generator, count: int, sheds: int = 9, seed: int = 4) -> np.ndarray:
     """Uneven ground with sheds at places of their own, their walls too, 1 cm of noise."""
     places = np.random.default_rng(seed)
