@@ -42,6 +42,8 @@ _LESS: Final = 0.05
 _SAME_SHADE: Final = 0.25
 """Of the contrast: opposite squares differ by less, and by no more than noise and a tenth of the contrast (gloss, dirt)."""
 _DIRT: Final = 0.1
+_NEARLY: Final = 0.2
+"""Share of the variance by which a target has to explain more than a board that is not sure: one of its squares looks like a disc."""
 _SURE: Final = 0.9
 """From which on a cross is no disc, nor a disc a cross: none explains so much of the other."""
 _SHARP_M: Final = 0.03
@@ -121,10 +123,18 @@ def find(
         if abs(plane.of(np.zeros((1, 3)))[0, 2]) <= SEARCH_M:
             on = np.abs(plane.of(every)[:, 2]) <= OFF_M
             found = _on_plane(plane, every[on], value[on], kinds, size_m)
-            targets = [replace(each, centre_m=each.centre_m + place_m) for each in found if isinstance(each, Target)]
+            doubtful = [each for each in found if isinstance(each, Doubt)]
+            # of a board that is not sure a square may still look like a disc
+            board = max((each.told for each in doubtful if each.kind == BOARD.name), default=0.0)
+            targets = [
+                each
+                for each in found
+                if isinstance(each, Target) and (each.told >= board + _NEARLY or each.kind == BOARD.name)
+            ]
             if targets:
+                targets = [replace(each, centre_m=each.centre_m + place_m) for each in targets]
                 return sorted(targets, key=lambda each: -each.told * each.points), []
-            doubts += [each for each in found if isinstance(each, Doubt)]
+            doubts += doubtful
         left = left[np.abs(plane.of(left)[:, 2]) > OFF_M]
     return [], doubts
 

@@ -1,6 +1,7 @@
 """Targets that are found by themselves: on simulated panels and balls of known place, and none where there is none."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import laspy
@@ -76,6 +77,41 @@ def test_a_ball_is_found_by_its_shape(radius_m: float) -> None:
         assert isinstance(found, Target)
         assert (np.abs(found.centre_m - centre) < 3.0 * found.sigma_m).all()
         assert found.sigma_m[2] < (0.025 if size is None else 0.012)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", list(TEXTURES))
+def test_no_centre_is_false_over_densities_contrasts_noise_and_scales(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: dict[str, Callable[[float, float], scenes.Texture]] = {
+        "checkerboard": lambda dark, bright: scenes.board(0.6, dark, bright),
+        "cross": lambda dark, bright: scenes.cross(0.7, 0.15, dark, bright),
+        "disc": lambda dark, bright: scenes.disc(0.4, dark, bright),
+    }
+    cases = (
+        (150.0, 0.1, 0.8, 0.15, 1.0),
+        (400.0, 0.2, 0.5, 0.15, 257.0),
+        (400.0, 0.8, 0.1, 0.3, 1.0),
+        (1500.0, 0.1, 0.8, 0.05, 1 / 255),
+    )
+    over, tried = [], 0
+    for per_m2, dark, bright, noise, scale in cases:
+        monkeypatch.setattr(scenes, "STRENGTH_NOISE", noise)
+        for seed in range(300, 306):
+            rng = np.random.default_rng(seed)
+            centre = np.append(rng.uniform(-0.25, 0.25, 2), 0.0)
+            texture = scenes.placed(drawn[kind](dark, bright), centre[:2], rng.uniform(0, np.pi))
+            xyz, value = scenes.seen([scenes.ground(texture)], per_m2, rng)
+            found = targets.find(rng.normal(0, 0.05, 3), xyz, scale * value, Wanted())
+            tried += 1
+            if isinstance(found, Target):
+                over.append((found.centre_m - centre) / found.sigma_m)
+                assert found.kind == kind
+                assert np.abs(over[-1]).max() < 5.0, (per_m2, noise, seed, found)
+    assert len(over) > 0.7 * tried
+    # of 50 to 72 errors over their sigmas: sigmas are estimates themselves, and a little large
+    assert 0.4 < np.mean(np.square(over)) < 1.7
 
 
 def _painted(name: str) -> scenes.Texture:
