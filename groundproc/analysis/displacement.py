@@ -35,7 +35,6 @@ _MOST: Final = 15_000
 _FEWEST: Final = 400
 _GROUP_M: Final = 4.0
 """Residuals within a square like this are one group in the covariance of a registration."""
-_UNKNOWNS: Final = 6
 _RELIEF: Final = 10.0
 """A direction is told where normals lean towards it by so many times the square of their sigma, at least ..."""
 _LEAST_RELIEF_RAD: Final = 0.03
@@ -210,8 +209,7 @@ def patch_moved(a_m: Array, b_m: Array, shift: Array) -> Vector | None:
         return None
     middle = b.mean(axis=0)
     back = found.move(middle[None])[0]
-    # few groups fit six unknowns too well: the correction of clustered covariances for that
-    covariance = found.covariance[:3, :3] * (groups / (groups - _UNKNOWNS)) + shift + _untold(a)
+    covariance = found.covariance[:3, :3] + shift + _untold(a)
     turn = float(np.arccos(np.clip((np.trace(found.matrix[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
     return Vector(back, middle - back, covariance, groups, turn, found.fit)
 

@@ -195,7 +195,7 @@ def _adjust(
     group = group.ravel()
     inverse = told @ np.linalg.solve(told.T @ (hessian - noise + np.eye(6)) @ told, told.T)
     covariance = inverse @ (_scatter(rows, weight, left, group) + np.eye(6)) @ inverse
-    covariance += _split(rows, scale, left, told, group)
+    covariance += _split(rows, scale, left, told, group, (noise + np.eye(6)) @ told, covariance)
     covariance += untold @ np.linalg.solve(untold.T @ untold, untold.T)
     return step * _PRIOR, covariance * np.outer(_PRIOR, _PRIOR), sigma(left)
 
@@ -242,19 +242,23 @@ def _scatter(rows: Array, weight: Array, left: Array, group: npt.NDArray[Any]) -
     return np.asarray(without.T @ without)
 
 
-def _split(rows: Array, scale: Array, left: Array, told: Array, group: npt.NDArray[Any]) -> Array:
-    """Covariance by how far the groups that tell of a direction disagree about it, those without weight too.
+def _split(
+    rows: Array, scale: Array, left: Array, told: Array, group: npt.NDArray[Any], parts: Array, known: Array
+) -> Array:
+    """What is to be added to a covariance by how far the groups that tell of a direction disagree about it, those without weight too.
 
+    Both are of the same error: the larger counts. `parts`, shape (6, k), take the part of each direction told out of a solution.
     Where half of them contradict the rest, as bushes do that lean each its own way, robust weights choose some that agree by chance.
     """
     out = np.zeros((6, 6))
-    for direction in told.T:
+    for direction, part in zip(told.T, parts.T, strict=True):
         along = rows @ direction / scale
         own = np.bincount(group, along**2)
         asked = np.abs(np.bincount(group, along * left / scale)) / np.maximum(own, 1e-12)
         order = np.argsort(asked)
         middle = MAD_TO_SIGMA * asked[order[np.searchsorted(np.cumsum(own[order]), 0.5 * own.sum())]]
-        out += np.outer(direction, direction) * middle**2 * (own**2).sum() / own.sum() ** 2
+        apart = middle**2 * (own**2).sum() / own.sum() ** 2
+        out += np.outer(direction, direction) * max(0.0, apart - float(part @ known @ part))
     return out
 
 

@@ -61,7 +61,8 @@ def test_what_slid_has_its_vector_and_what_stayed_has_none(made: Path) -> None:
     assert found["significant"][stays].mean() <= 0.2
     assert np.abs(vectors[slides] - MOVED).max() < 0.03
     assert (np.abs(vectors[slides] - MOVED) < 4.0 * sigmas[slides]).mean() > 0.95
-    assert sigmas[slides].max() < 0.02
+    assert np.median(sigmas[slides]) < 0.01
+    assert sigmas[slides].max() < 0.05, "a patch with relief in one corner tells one way less well"
     assert np.allclose(np.diff(ends, axis=1)[:, 0], vectors, atol=1e-3)
 
 
