@@ -37,7 +37,8 @@ class Viewer {
     this.camera.fit(this.aspect);
     this.panel();
     this.dress();
-    this.shade("z");
+    // what was photographed is what people know again
+    this.shade(this.shades.some(each => each.name === "rgb") ? "rgb" : "z");
     new ResizeObserver(() => { this.dirty = true; }).observe(this.canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.dress());
     const frame = () => { requestAnimationFrame(frame); this.frame(); };

@@ -18,6 +18,8 @@ from browser import PROGRAM, Page, browser
 from groundproc.cli import main
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
+from groundproc.geodesy import projected_crs
+from tests.groundproc.viewer.conftest import ground
 
 Clouds = Callable[[int], tuple[Path, Path]]
 needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
@@ -84,6 +86,22 @@ def test_what_is_near_is_shown_in_full_and_what_is_far_is_not(tab: Page, clouds:
         settled(tab)
         assert tab.run("swathViewer.drawn") == 0
         assert 0 < near < POINTS
+        assert tab.said == []
+
+
+@needs_browser
+def test_a_coloured_cloud_is_shown_in_its_colours(tab: Page, tmp_path: Path) -> None:
+    points = ground(3000)
+    spread = np.linspace(0, 65535, len(points)).astype(np.uint16)
+    columns = points.columns | {"red": spread, "green": spread // 2, "blue": 65535 - spread}
+    path = tmp_path / "coloured.laz"
+    with CloudWriter(path, columns, crs=projected_crs(32633), offset_m=(533_000.0, 6_472_000.0, 0.0)) as writer:
+        writer.write(Points(points.time_ns, points.xyz_m, columns))
+    with viewed(path) as (address, _):
+        tab.open(address)
+        settled(tab)
+        assert tab.run("swathViewer.chooser.value") == "rgb"
+        assert tab.run("swathViewer.look.mode") == 3
         assert tab.said == []
 
 
