@@ -150,7 +150,7 @@ class Told:
         ]  # fmt: skip
         matrix, gradient, _ = made[0].poses(Lasting())
         inverse = np.linalg.inv(adjusted.found.matrix[np.ix_(used, used)])
-        return replace(made[1], matrix=inverse - matrix, gradient=-gradient)
+        return replace(made[1], matrix=_without_rounding(inverse - matrix, np.diag(inverse)), gradient=-gradient)
 
     def poses(self, lasting: Lasting) -> tuple[Array, Array, float]:
         """Normal matrix and gradient of observed poses, and the sum of their squares."""
@@ -173,6 +173,16 @@ class Told:
         spread = np.log(np.diag(lower)).sum() + 1.5 * count * np.log(lasting.place * lasting.turn)
         spread += 1.5 * np.log(1.0 - kept**2).sum()
         return float(0.5 * (pulled @ pulled - square) - spread)
+
+
+def _without_rounding(matrix: Array, scale: Array) -> Array:
+    """A difference of normal matrices, of which nothing is negative but by rounding: a millionth, as one of them was inverted twice.
+
+    `scale` is the diagonal of the larger one.
+    """
+    size = np.sqrt(scale)
+    value, axis = np.linalg.eigh(matrix / np.outer(size, size))
+    return np.asarray((axis * np.maximum(value, 0.0)) @ axis.T * np.outer(size, size))
 
 
 def _kept(time_s: Array, before: Ints, lasting: Lasting) -> Array:

@@ -212,7 +212,7 @@ def adjust_run(
     sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
     attitudes = next((found for leg in legs if (found := attitude_track(leg)) is not None), None)
     stated = Recorded(position_track(given, legs[0]), attitudes)
-    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, guide=start)
+    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, guide=start, in_time=False)
     pace = Pace(progress)
     windows: list[Window] = []
     begin = 0

@@ -62,8 +62,8 @@ def redo_beginning(
         track.quat[count].copy(), track.position_m[count].copy(), -track.velocity_m_s[count - 1],
         -track.gyro_bias[count - 1], state.accel_bias_m_s2.copy(), state.gravity_m_s2.copy(), np.diag(SIGMA**2),
     )  # fmt: skip
-    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m)
-    odometry.line = before.line.reversed()
+    line = None if before.line is None else before.line.reversed()
+    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line)
     odometry.map = _map_of(track, motion, count, min(count + AFTER, len(track)))
     found: dict[int, tuple[State, Step | None]] = {}
     for piece in reversed(early):

@@ -81,6 +81,8 @@ class Odometry:
     number : int
     voxel_m : float
         Edge of the map's voxels.
+    line : Line, optional
+        The line of the spin, where it is to be found in time and taken off the lidar's own gyro.
     """
 
     MOST: Final = 4000.0
@@ -88,13 +90,13 @@ class Odometry:
     REACH_M: Final = 250.0
     """The map forgets what lies farther away than this."""
 
-    def __init__(self, state: State, motion: MotionGrid, number: int, voxel_m: float) -> None:
+    def __init__(self, state: State, motion: MotionGrid, number: int, voxel_m: float, line: Line | None = None) -> None:
         self.state, self.number, self.voxel_m = state, number, voxel_m
         self._motion = motion
         self.map = PlaneMap(voxel_m)
         self._cluster = Clusterer(voxel_m)
         self._ground = np.zeros(3)
-        self.line = Line()
+        self.line = line if motion.source == LIDAR else None
         self._within = Within(max(motion.rate_density, 1e-6))
         density = 2.0 * max(motion.rate_density, 1e-6), 3.0 * max(motion.force_density, 1e-4)
         step = STEP_S
@@ -142,7 +144,7 @@ class Odometry:
         """Take the next slice: propagate, match, correct, and add it to the map."""
         self.propagate(piece.number - 1)
         rate, force = self._inertial(piece.number)
-        if self._motion.source == LIDAR:
+        if self.line is not None:
             rate = rate - self.line.read(self._motion, piece)
         quats, positions = self._carry(rate, force)
         start_ns = self._motion.start_ns + piece.number * STEPS * STEP_NS

@@ -13,6 +13,7 @@ from groundproc.estimation.odometry.history import History
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import MotionGrid
 from groundproc.estimation.odometry.odometry import Odometry, Step
+from groundproc.estimation.odometry.rotor import Line
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.start import RoughPoses, state_at
 from groundproc.estimation.odometry.state import State
@@ -71,12 +72,15 @@ class Tracker:
     guide : RoughPoses, optional
         Poses whose motion within a second is right to a few decimetres, as a smoother's is: an odometry that goes elsewhere, and is
         held by little, has lost its way.
+    in_time : bool
+        Whether poses are stated as they come: then the line of the spin is taken off in time. A batch finds it by surfaces.
     """
 
     def __init__(
         self, motion: MotionGrid, rough: RoughPoses, mat_ins_lidar: Array, lever_m: Array, gyro_bias: Array,
-        stated: Stated, keep: bool = True, guide: RoughPoses | None = None,
+        stated: Stated, keep: bool = True, guide: RoughPoses | None = None, in_time: bool = True,
     ) -> None:  # fmt: skip
+        self._in_time = in_time
         self.motion, self._rough, self._mat, self._lever = motion, rough, mat_ins_lidar, lever_m
         self._bias, self._stated, self.keep = gyro_bias, stated, keep
         self.odometry: Odometry | None = None
@@ -124,7 +128,7 @@ class Tracker:
             return False
         self._range_m = _median_range(piece)
         voxel_m = _edge(self._range_m)
-        self.odometry = Odometry(state, self.motion, piece.number, voxel_m)
+        self.odometry = Odometry(state, self.motion, piece.number, voxel_m, Line() if self._in_time else None)
         self.track = Track(piece.number, [state.quat.copy()], [state.position_m.copy()], voxel_m=voxel_m)
         self._set_out(state, piece.number)
         return True
