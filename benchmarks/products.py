@@ -248,6 +248,7 @@ class Cluster:
             self._start("dask_worker", "--scheduler-file", told, *words)
         from dask.distributed import Client
 
+        # Dask is not typed
         with Client(scheduler_file=str(told), timeout="60s", set_as_default=False) as client:  # type: ignore[no-untyped-call]
             client.wait_for_workers(self._workers, timeout=60.0)  # type: ignore[no-untyped-call]
             return str(client.scheduler.address)

@@ -65,8 +65,8 @@ class Handler(BaseHTTPRequestHandler):
     headers_told: ClassVar[Mapping[str, str]] = {}
 
     def get(self, url: SplitResult) -> None:
-        """Answer a GET of one's own machine."""
-        raise NotImplementedError
+        """Answer a GET of one's own machine; a page has its own answers."""
+        self.answer(404, "text/plain", b"not here\n")
 
     def post(self) -> None:
         """Answer a POST, of whomever: its body must be read before it is refused."""

@@ -42,7 +42,7 @@ def passes(keys: npt.NDArray[np.int64], side: Side, edge_m: float) -> npt.NDArra
 
 
 @njit(cache=True, nogil=True)
-def _through(keys: Any, xyz: Any, away: Any, edge_m: float, table: Any, passes: Any) -> None:  # noqa: C901 (a kernel)
+def _through(keys: Any, xyz: Any, away: Any, edge_m: float, table: Any, passes: Any) -> None:  # noqa: C901 (a kernel: a call for each step of a beam would cost more than the step)
     """Count the beams that went through voxels: from the echo towards the sensor, as long as they can meet one."""
     mask, per_m = len(table) - 1, 1.0 / edge_m
     packed = np.empty(len(keys), np.int64)

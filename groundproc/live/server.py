@@ -53,7 +53,7 @@ class _Handler(Handler):
         elif url.path == "/path":
             self._path(query)
         else:
-            self.answer(404, "text/plain", b"not here\n")
+            super().get(url)
 
     def _points(self, query: dict[str, str]) -> None:
         """Positions as float32 triples, then intensities as bytes."""

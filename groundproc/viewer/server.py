@@ -72,7 +72,7 @@ class _Handler(Handler):
         elif url.path == "/node":
             self._node(parse_qs(url.query).get("key", [""])[0])
         else:
-            self.answer(404, "text/plain", b"not here\n")
+            super().get(url)
 
     def post(self) -> None:
         """Take edits, or save; only from our own page, which knows the token."""

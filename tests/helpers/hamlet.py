@@ -357,9 +357,8 @@ def angles(shot: Shot) -> tuple[float, float, float]:
     grid_enu = np.array([[np.cos(g), -np.sin(g), 0.0], [np.sin(g), np.cos(g), 0.0], [0.0, 0.0, 1.0]])
     m = grid_enu @ shot.turn @ np.diag([1.0, -1.0, -1.0])
     # Rx(o) Ry(p) Rz(k) has sin p in its upper right corner
-    return tuple(
-        np.rad2deg([np.arctan2(-m[1, 2], m[2, 2]), np.arcsin(m[0, 2]), np.arctan2(-m[0, 1], m[0, 0])]).tolist()
-    )  # type: ignore[return-value]
+    omega, phi, kappa = np.arctan2(-m[1, 2], m[2, 2]), np.arcsin(m[0, 2]), np.arctan2(-m[0, 1], m[0, 0])
+    return float(np.rad2deg(omega)), float(np.rad2deg(phi)), float(np.rad2deg(kappa))
 
 
 def write_block(
