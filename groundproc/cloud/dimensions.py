@@ -172,6 +172,18 @@ TABLE: Final = (
         no_data=65535,
     ),
     Dimension(
+        "smoothed", "u1", "1 moved onto its surface", "1: moved onto the surface that the points around tell; 0: as it was measured.",
+        "`swath smooth`",
+    ),
+    Dimension(
+        "smoothing", "i2", "moved by smoothing", "How far it was moved, along the normal of its surface.", "`swath smooth`", "m", 0.0001,
+        no_data=-32768,
+    ),
+    Dimension(
+        "smoothing_sigma", "u2", "sigma of surface", "How well that surface is known there, one sigma, beside what all its points share.",
+        "`swath smooth`", "m", 0.0001, no_data=65535,
+    ),
+    Dimension(
         "reflectance", "f4", "diffuse reflectance",
         "Share of the light that a surface throws back, as a white Lambertian one throws back all; not a number where the echo is of a "
         "retro-reflector or beyond what the sensor can tell.", "`swath reflectance`",

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 
+from flightlog import __version__
 from flightlog.errors import CaptureError, SourceError
 from groundproc.cloud.dimensions import Dimension, in_order
 from groundproc.cloud.packer import extra_bytes
@@ -56,6 +57,11 @@ class Rewriter:
         Attributes of the table that every `write` gives values of. Extra bytes of that name that the cloud had are replaced.
     frame : Frame, optional
         Other coordinates, for `write_at`; default: those of the cloud.
+    system : str, optional
+        At most 31 characters for the header's system identifier, where the points are no longer as they were measured; then the
+        generating software is swath. Default: as the cloud has both.
+    records : sequence of laspy.VLR
+        More that stand in the file.
 
     Raises
     ------
@@ -66,7 +72,14 @@ class Rewriter:
     """
 
     def __init__(
-        self, cloud: Cloud, path: Path, compressed: bool = True, added: Iterable[str] = (), frame: Frame | None = None
+        self,
+        cloud: Cloud,
+        path: Path,
+        compressed: bool = True,
+        added: Iterable[str] = (),
+        frame: Frame | None = None,
+        system: str | None = None,
+        records: Sequence[laspy.VLR] = (),
     ) -> None:
         self.path, self.name = path, cloud.path
         self._added = in_order(added)
@@ -78,9 +91,12 @@ class Rewriter:
             header.global_encoding, header.uuid = old.global_encoding, old.uuid
             header.file_source_id = old.file_source_id
             header.system_identifier, header.generating_software = old.system_identifier, old.generating_software
+            if system is not None:
+                header.system_identifier, header.generating_software = system[:31], f"swath {__version__}"[:31]
             header.creation_date = old.creation_date
             # the index of a COPC file, which LAZ would not keep true, and records that laspy writes itself
             header.vlrs.extend(v for v in old.vlrs if v.user_id not in _NOT_KEPT and not _is_extra_bytes(v))
+            header.vlrs.extend(records)
             if old.version.minor >= 4:
                 reader.read_evlrs()
             if frame is not None:

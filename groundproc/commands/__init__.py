@@ -11,8 +11,8 @@ CHAPTERS: Final = {
     "recordings": ("pull", "info", "import", "recover", "replay", "bag"),
     "from flight to cloud": ("init", "process", "batch", "live", "report", "view", "decode"),
     "trajectory and calibration": ("calibrate", "compass", "ppk", "adjust", "verify-sensor"),
-    "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "fuse", "merge", "tile",
-        "transform"),
+    "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "smooth", "fuse", "merge",
+        "tile", "transform"),
     "what people fly for": (
         "ground", "trees", "wires", "pipes", "windows", "detect", "moving", "soil", "change", "displacement",
         "viewshed", "passability", "reflectance", "orthophoto",

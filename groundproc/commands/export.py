@@ -85,9 +85,8 @@ def _cloud(arguments: argparse.Namespace) -> int:
 
     output = arguments.output
     expect([arguments.source], CLOUD, CLOUD_WORDS)
-    claim_file(
-        output, [f".{ending.rpartition('.')[2]}" for ending in exports.FORMATS], arguments.force, [arguments.source]
-    )
+    endings = [*dict.fromkeys(f".{ending.rpartition('.')[2]}" for ending in exports.FORMATS), ".copc.laz"]
+    claim_file(output, endings, arguments.force, [arguments.source])
     cloud = reader.look(arguments.source)
     left_out: Mapping[str, int] = {}
     bar = tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty())

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     if again:
         raise UsageError(f"{again[0]}: given twice; expected each cloud once")
     expect(paths, CLOUD, CLOUD_WORDS)
-    claim_file(arguments.output, (".laz",), arguments.force, paths)
+    claim_file(arguments.output, (".laz", ".copc.laz"), arguments.force, paths)
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
     clouds = [reader.look(path) for path in paths]

@@ -6,7 +6,9 @@ Folders above a name that are missing are made, by every command, when it writes
 import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+_OCTREE: Final = ".copc.laz"
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +45,11 @@ def claim_file(path: Path, suffixes: Sequence[str], force: bool, inputs: Iterabl
         raise UsageError(
             f"{path}: ends in {path.suffix or 'nothing'}, expected a name that ends in {' or '.join(suffixes)}, such as "
             f"{path.with_suffix(suffixes[0]) if path.name else f'NAME{suffixes[0]}'}"
+        )
+    if path.name.lower().endswith(_OCTREE) and _OCTREE not in suffixes:
+        plain = path.with_name(path.name[: -len(_OCTREE)] + ".laz")
+        raise UsageError(
+            f"{path}: ends in {_OCTREE}, but this command writes no octree; expected {plain.name}: `swath export` makes a COPC of it"
         )
     _refuse(path, force)
 

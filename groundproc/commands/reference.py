@@ -20,7 +20,7 @@ READ_ON: Final = {
     "pipes": "uses/pipes.md", "plan": "plan.md", "ppk": "positions.md", "process": "processing.md", "profile": "clouds.md#profiles",
     "pull": "install.md#get-the-logs-swath-pull", "raster": "clouds.md", "recover": "aircraft.md#flight-logs",
     "reflectance": "uses/reflectance.md", "replay": "tutorial.md", "report": "report.md", "section": "uses/section.md",
-    "simulate": "simulator.md", "soil": "uses/soil.md",
+    "simulate": "simulator.md", "smooth": "uses/smooth.md", "soil": "uses/soil.md",
     "tile": "clouds.md#tiles", "tin": "clouds.md#triangles-for-design-and-machine-control",
     "transform": "transform.md", "trees": "uses/trees.md",
     "verify-sensor": "uses/verify-sensor.md", "view": "view.md", "viewshed": "uses/viewshed.md", "volume": "clouds.md#volumes",

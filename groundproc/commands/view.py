@@ -58,8 +58,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--force given, but nothing uses it: without --edited nothing is written")
     cloud, paths = _chosen(arguments.cloud)
     if arguments.edited is not None:
-        if arguments.edited.name.lower().endswith(".copc.laz"):
-            raise UsageError(f"{arguments.edited}: expected a .laz or .las; `swath export` makes a COPC of it")
         claim_file(arguments.edited, (".laz", ".las"), arguments.force, [cloud])
     over = threading.Event()
 

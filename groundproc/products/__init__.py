@@ -57,6 +57,10 @@ REGISTRY: Final[dict[str, Entry]] = {
         "groundproc.products.strip_difference", "StripDifference", "by how much flight lines differ in height, cells of 0.5 m",
         by_default=False,
     ),
+    "cloud_smooth.laz": Entry(
+        "groundproc.products.cloud_smooth", "write", "a copy freed of the sensor's noise, marked as such; see `swath smooth`",
+        by_default=False,
+    ),
     "trajectory.gpkg": Entry("groundproc.products.trajectory_gpkg", "write", "the flown path as lines, for maps"),
     "trajectory.gpx": Entry(
         "groundproc.products.trajectory_maps", "write", "the flown path for phones and globes: trajectory.gpx and .kml", by_default=False

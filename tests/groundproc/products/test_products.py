@@ -235,3 +235,23 @@ def test_tiles_hold_the_points_of_the_cloud(context: Context) -> None:
     found = np.concatenate([each.xyz for each in tiles])
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(whole.xyz, axis=0), rtol=0, atol=1e-9)
     assert (context.folder / "tiles" / "cloud.vpc").is_file()
+
+
+def test_a_smoothed_cloud_is_made_of_the_finished_one(context: Context) -> None:
+    rng = np.random.default_rng(4)
+    count = 6_000
+    place = rng.uniform([533_000, 6_472_000, 0], [533_004, 6_472_004, 0], (count, 3))
+    place[:, 2] = rng.normal(5.0, 0.015, count)
+    crs = context.crs
+    with CloudWriter(context.finished / "cloud.laz", [], crs=crs, offset_m=(533_000, 6_472_000, 0)) as writer:
+        writer.write(Points(START_NS + np.arange(count), place, {}))
+    draw(chosen(["cloud_smooth.laz"]), context)
+    made = laspy.read(context.folder / "cloud_smooth.laz")
+    assert np.std(made.z) < 0.5 * 0.015
+    assert np.mean(made.smoothed) > 0.9
+
+
+def test_a_smoothed_cloud_needs_a_cloud(context: Context) -> None:
+    with pytest.raises(SourceError, match=r"cloud_smooth.laz: no product holds the points; expected cloud.laz"):
+        draw(chosen(["cloud_smooth.laz"]), context)
+    assert names(context.folder) == []
