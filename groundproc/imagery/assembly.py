@@ -184,7 +184,8 @@ def _only(known: Known, keep: Ints, camera: Ints) -> tuple[Known, Ints, Ints]:
     priors = known.priors
     inside = row[priors.station] >= 0
     fields = ("place_m", "mat_local_ins", "covariance", "arm_m", "velocity_m_s", "turning_rad_s", "weight")
-    priors = PosePriors(row[priors.station[inside]], *(getattr(priors, name)[inside] for name in fields))
+    chosen = {name: getattr(priors, name)[inside] for name in fields}
+    priors = replace(priors, station=row[priors.station[inside]], **chosen)
     return Known(known.posed[keep], stations, station, priors), image_row, camera[keep]
 
 

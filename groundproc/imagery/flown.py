@@ -27,6 +27,10 @@ _STEP_NS: Final = 5_000_000
 _QUARTER_NS: Final = 900 * 10**9
 _MOST_QUARTERS: Final = 56
 """Local times are at most 14 h from UTC, in quarters of an hour."""
+LATE_SIGMA_S: Final = 0.01
+"""By how much an autopilot's attitudes may be later than places: what filters of gyros delay them."""
+OF_AUTOPILOT: Final = ("filtered", "ins")
+"""Methods whose attitudes are the autopilot's; one clock is behind all that others find."""
 PLAIN_PLACE_M: Final = (0.1, 0.1, 0.15)
 PLAIN_TURN_RAD: Final = float(np.deg2rad(0.3))
 """Of a trajectory that states no sigmas."""
@@ -34,8 +38,8 @@ _LEAST_PLACE_M: Final = 0.002
 _LEAST_TURN_RAD: Final = float(np.deg2rad(0.002))
 
 
-def load_trajectory(path: Path) -> Trajectory:
-    """A trajectory.csv, with the covariance beside it where an estimate left one; or the folder of an estimate.
+def load_trajectory(path: Path) -> tuple[Trajectory, float]:
+    """A trajectory.csv, with the covariance beside it, or the folder of an estimate; and by how much its attitudes may be late [s].
 
     Raises
     ------
@@ -44,8 +48,9 @@ def load_trajectory(path: Path) -> Trajectory:
     """
     folder = path if path.is_dir() else path.parent
     if path.is_dir() or (path.name == TRAJECTORY and is_estimate(folder)):
-        return read_estimate(folder).trajectory
-    return read_trajectory(path)
+        estimate = read_estimate(folder)
+        return estimate.trajectory, LATE_SIGMA_S if estimate.method in OF_AUTOPILOT else 0.0
+    return read_trajectory(path), 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +170,12 @@ def stations_of(trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints) -
     return Known(covered.copy(), stations, station, priors), covered
 
 
+def with_lateness(block: Block, sigma_s: float) -> Block:
+    """The block with attitudes that may be later than places: once its clocks are found, for one is taken for the other before."""
+    common = replace(block.priors.common, late_sigma_s=sigma_s)
+    return replace(block, priors=replace(block.priors, common=common))
+
+
 def _shift_ns(rig: Rig, lead: Ints) -> Ints:
     shift_s = np.array([one.timeshift_s for one in rig.cameras])
     return np.asarray(np.rint(shift_s[lead] * 1e9), np.int64)
@@ -174,23 +185,26 @@ def resampled(trajectory: Trajectory, block: Block) -> Block:
     """The block with poses observed where the clocks, as they are now known, put them; a block on a straight line needs it least."""
     stations, priors = block.stations, block.priors
     at = priors.station
-    sampled = sample(trajectory, stations.time_ns[at] + _shift_ns(block.rig, stations.lead[at]))
-    if not sampled.covered.all():
-        late = int(stations.time_ns[at][~sampled.covered][0])
+    time_ns = stations.time_ns[at] + _shift_ns(block.rig, stations.lead[at])
+    sampled = sample(trajectory, time_ns)
+    later = sample(trajectory, time_ns + round(priors.common.late_s * 1e9))
+    covered = sampled.covered & later.covered
+    if not covered.all():
+        late = int(stations.time_ns[at][~covered][0])
         raise CoverageError(
             f"images: the clock's shift puts that of {utc_text(late)} outside of the trajectory; state its sigma or fix it"
         )
     velocity, rate = stations.velocity_m_s.copy(), stations.rate_rad_s.copy()
-    velocity[at], rate[at] = sampled.velocity_m_s, sampled.rate_rad_s
+    velocity[at], rate[at] = sampled.velocity_m_s, later.rate_rad_s
     return replace(
         block,
         stations=replace(stations, velocity_m_s=velocity, rate_rad_s=rate),
         priors=replace(
             priors,
             place_m=sampled.place_m,
-            mat_local_ins=sampled.mat_local_ins,
+            mat_local_ins=later.mat_local_ins,
             covariance=sampled.covariance,
             velocity_m_s=sampled.velocity_m_s,
-            turning_rad_s=np.einsum("kij,kj->ki", sampled.mat_local_ins, sampled.rate_rad_s),
+            turning_rad_s=np.einsum("kij,kj->ki", later.mat_local_ins, later.rate_rad_s),
         ),
     )

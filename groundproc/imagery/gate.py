@@ -1,9 +1,11 @@
 """Is a boresight or a clock's shift real? Views that are held out must agree better with it than without.
 
 Every fifth station loses its image points. Its pose is then the trajectory's, with the mounting and the clock that the others found, and
-the points that the others placed are looked at from there.
+the points that the others placed are looked at from there. All groups are free to begin with, and the one that helps least is taken away
+until every one that is left helps: a boresight that is tried while a clock is still off by pixels makes nothing better.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -43,24 +45,33 @@ def accepted(block: Block, known: tuple[RigCamera, ...]) -> tuple[tuple[tuple[st
     stations = np.unique(block.priors.station)
     wanted = [candidates(one) for one in known]
     if len(stations) < LEAST_STATIONS:
-        every = tuple(tuple(u for name, group in GROUPS if name in own for u in group) for own in wanted)
-        told = [{"group": name, "accepted": True, "reason": "too few views to hold any out"} for name, _ in GROUPS
-                if any(name in own for own in wanted)]  # fmt: skip
-        return every, told
+        few = [{"group": name, "accepted": True, "reason": "too few views to hold any out"} for name, _ in GROUPS
+               if any(name in own for own in wanted)]  # fmt: skip
+        return _unknowns_of([name for name, _ in GROUPS], wanted), few
     held = np.isin(block.station[block.measured.image], stations[EVERY // 2 :: EVERY])
-    taken: tuple[tuple[str, ...], ...] = tuple(() for _ in known)
-    best = _error(block, known, taken, held)
-    told = []
-    for name, group in GROUPS:
-        if not any(name in own for own in wanted):
-            continue
-        trial = tuple((*have, *group) if name in own else have for have, own in zip(taken, wanted, strict=True))
-        error = _error(block, known, trial, held)
-        better = error < BETTER * best
-        told.append({"group": name, "accepted": bool(better), "held_out_px": error, "without_px": best})
-        if better:
-            taken, best = trial, error
-    return taken, told
+    left = [name for name, _ in GROUPS if any(name in own for own in wanted)]
+
+    def error(groups: Sequence[str]) -> float:
+        return _error(block, known, _unknowns_of(groups, wanted), held)
+
+    told: dict[str, dict[str, Any]] = {}
+    best = error(left)
+    while left:
+        without = {name: error([other for other in left if other != name]) for name in left}
+        told |= {
+            name: {"group": name, "accepted": best < BETTER * without[name], "held_out_px": best, "without_px": without[name]}
+            for name in left
+        }  # fmt: skip
+        least = min(left, key=without.__getitem__)
+        if told[least]["accepted"]:
+            break
+        left, best = [name for name in left if name != least], without[least]
+    return _unknowns_of(left, wanted), [told[name] for name, _ in GROUPS if name in told]
+
+
+def _unknowns_of(groups: Sequence[str], wanted: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    """Unknowns of each camera where some groups are free."""
+    return tuple(tuple(u for name, group in GROUPS if name in groups and name in own for u in group) for own in wanted)
 
 
 def _error(block: Block, known: tuple[RigCamera, ...], mounting: tuple[tuple[str, ...], ...], held: Mask) -> float:

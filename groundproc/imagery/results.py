@@ -153,6 +153,14 @@ def figures(adjusted: Adjusted, site: Site, names: tuple[str, ...], control: Con
     return told
 
 
+def common_of(adjusted: Adjusted) -> dict[str, Any]:
+    """What all poses of the trajectory are found to be off together."""
+    solved = adjusted.solved
+    column = int(solved.unknowns.common[0])
+    sigma = scale_of(adjusted) * np.sqrt(adjusted.found.matrix[column, column]) if column >= 0 else np.nan
+    return {"attitudes_late_s": solved.block.priors.common.late_s, "attitudes_late_sigma_s": _number(sigma)}
+
+
 def _number(value: Any) -> float | None:
     """A number of JSON; None for what is none."""
     return float(value) if np.isfinite(value) else None

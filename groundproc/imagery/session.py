@@ -90,6 +90,8 @@ class Session:
     control : Control, optional
     start : ImagePoses, optional
     trajectory : Trajectory, optional
+    late_sigma_s : float
+        By how much its attitudes may be later than its places.
     site : Site
     timed : Timed, optional
         By which events times were found.
@@ -109,6 +111,7 @@ class Session:
     control: Control | None = None
     start: ImagePoses | None = None
     trajectory: Trajectory | None = None
+    late_sigma_s: float = 0.0
     site: Site = field(default_factory=lambda: cartesian(np.zeros((1, 3))))
     timed: Timed | None = None
     lasting: Lasting = field(default_factory=Lasting)
@@ -210,8 +213,9 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
         _take(session, timed)
     if task.log is not None:
         session.trajectory = trajectory_of(task.log, task.positions, task.geoid, progress)
+        session.late_sigma_s = flown.LATE_SIGMA_S
     elif task.trajectory is not None:
-        session.trajectory = flown.load_trajectory(task.trajectory)
+        session.trajectory, session.late_sigma_s = flown.load_trajectory(task.trajectory)
     if session.trajectory is None:
         return
     if timed is None:

@@ -122,7 +122,7 @@ def _adjusted(
     block = replace(made.block, measured=made.block.measured.masked(few))
     adjusted = adjust(block, known, matched[few], told)
     mounting, held_out = gate.accepted(adjusted.solved.block, known)
-    block = replace(adjusted.solved.block, mounting=mounting)
+    block = flown.with_lateness(replace(adjusted.solved.block, mounting=mounting), session.late_sigma_s)
     adjusted = _settled(session, block, known, matched[few], told)
     if surface is not None:
         adjusted = _on_surface(adjusted, surface, known, matched[few], told)
@@ -130,7 +130,7 @@ def _adjusted(
     if not few.all():
         block = completed(adjusted.solved.block, made.block, matched, adjusted.sigma_px)
         adjusted = adjust(block if surface is None else held_to(block, surface), known, matched, told, begun=True)
-    return adjusted, {"held_out": held_out, "lasting": asdict(session.lasting)}
+    return adjusted, {"held_out": held_out, "lasting": asdict(session.lasting)} | results.common_of(adjusted)
 
 
 def _on_surface(
@@ -164,8 +164,8 @@ def _with_clocks(
     before: npt.NDArray[np.float64] | None = None
     for _ in range(_MOST_ROUNDS):
         block = adjusted.solved.block
-        now = np.array([one.timeshift_s for one in block.rig.cameras])
-        if np.array_equal(now, [one.timeshift_s for one in known]) or (
+        now = np.array([*(one.timeshift_s for one in block.rig.cameras), block.priors.common.late_s])
+        if np.array_equal(now, [*(one.timeshift_s for one in known), 0.0]) or (
             before is not None and np.abs(now - before).max() < _SETTLED_S
         ):
             break

@@ -130,6 +130,37 @@ def joined_rows(first: PointRows, second: PointRows) -> PointRows:
 
 
 @dataclass(frozen=True, slots=True)
+class Common:
+    """What all observed poses of a trajectory are off together.
+
+    Attributes
+    ----------
+    late_s, late_sigma_s : float
+        By how much its attitudes are later than its places: filters delay an autopilot's gyros, and its receiver has a clock of its own.
+        A sigma of 0 holds it.
+    centre_m : ndarray, shape (3,)
+        What the turn is about.
+    moved : ndarray, shape (6,)
+        Shift [m] and turn in the local frame [rad] of the trajectory against the truth.
+    covariance : ndarray, shape (6, 6), optional
+        Of `moved` before; None: it is held.
+    cloud : bool
+        The lidar's planes were made with the trajectory, and are off with it.
+    """
+
+    late_s: float = 0.0
+    late_sigma_s: float = 0.0
+    centre_m: Array = field(default_factory=lambda: np.zeros(3))
+    moved: Array = field(default_factory=lambda: np.zeros(POSE))
+    covariance: Array | None = None
+    cloud: bool = False
+
+    def shift_m(self, places_m: Array) -> Array:
+        """How far places, shape (n, 3), are moved."""
+        return np.asarray(self.moved[:3] + np.cross(self.moved[3:], places_m - self.centre_m))
+
+
+@dataclass(frozen=True, slots=True)
 class PosePriors:
     """Observed poses of stations: place + mat arm, and where it is stated attitude.
 
@@ -151,6 +182,8 @@ class PosePriors:
         Row of the pose before each in time, -1 for none; absent: all poses are independent.
     keep : ndarray, shape (k, 2), optional
         Correlation of errors of place and of turn, in units of their sigmas, with those of the pose before.
+    common : Common
+        `covariance` is of what is left beside it.
     """
 
     station: Ints
@@ -163,6 +196,7 @@ class PosePriors:
     weight: Array
     before: Ints | None = None
     keep: Array | None = None
+    common: Common = field(default_factory=Common)
 
     def __len__(self) -> int:
         return len(self.station)

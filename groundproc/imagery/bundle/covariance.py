@@ -1,6 +1,6 @@
 """How well things are known after an adjustment: cofactors times sigma0 squared, of poses, cameras and points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -104,7 +104,7 @@ def balance(solved: Solved, found: Cofactors) -> Balance:
     priors = block.priors
     stated = np.isfinite(np.diagonal(priors.covariance, axis1=1, axis2=2)) & (priors.weight > 0.0)[:, None]
     points = int(found.normal.kept.determined.sum())
-    known = len(known_rows(block, solved.known, solved.unknowns)[2])
+    known = len(known_rows(block, solved.known, solved.unknowns)[2]) + int((solved.unknowns.common >= 0).sum())
     return Balance(
         2 * int((block.measured.weight > 0.0).sum()), int(stated.sum()), int((block.rows.weight > 0.0).sum()), known,
         solved.unknowns.size + 3 * points, points, solved.cost,
@@ -119,6 +119,14 @@ def of_columns(matrix: Array, columns: npt.NDArray[np.int64]) -> Array:
     part = part.copy()
     part[held], part[:, held] = 0.0, 0.0
     return np.asarray(part)
+
+
+def given_of(matrix: Array, columns: npt.NDArray[np.int64]) -> Array:
+    """Cofactors were some columns known, shape (n, n); -1 stands for a held value."""
+    own = columns[columns >= 0]
+    if not len(own):
+        return matrix
+    return np.asarray(matrix - matrix[:, own] @ np.linalg.solve(matrix[np.ix_(own, own)], matrix[own]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +205,9 @@ def traces(solved: Solved, found: Cofactors) -> tuple[float, float]:
     rows = block.rows
     if not len(rows):
         return poses, 0.0
-    cofactor = points_covariance(block, found, 1.0)[rows.point]
+    # planes that are off as the poses are tell nothing of where all of it lies
+    against = replace(found, matrix=given_of(found.matrix, solved.unknowns.common[1:]))
+    cofactor = points_covariance(block, against, 1.0)[rows.point]
     share = np.einsum("mi,mij,mj->m", rows.normal, cofactor, rows.normal) * rows.weight / rows.sigma_m**2
     return poses, float(np.nansum(share))
 

@@ -21,7 +21,9 @@ def pose_residuals(block: Block, priors: PosePriors) -> Array:
     stations, at = block.stations, priors.station
     mat = stations.mat_local_ins[at]
     place = stations.place_m[at] + np.einsum("kij,kj->ki", mat, priors.arm_m) - priors.place_m
+    place += priors.common.shift_m(priors.place_m)
     turn = frames.quat_log(frames.quat_from_mat(mat @ np.swapaxes(priors.mat_local_ins, 1, 2)))
+    turn += priors.common.moved[3:]
     return np.concatenate([place, turn], axis=1)
 
 
@@ -37,25 +39,28 @@ def whitening(covariance: Array) -> Array:
 
 
 def bare_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
-    """Residuals of observed poses [m, rad], shape (k, 6), their derivatives, shape (k, 6, 7), and their columns, shape (k, 7), -1 for none.
+    """Residuals of observed poses [m, rad], shape (k, 6), derivatives, shape (k, 6, 14), and columns, shape (k, 14), -1 for none.
 
-    The seventh column is the shift of the camera's clock: later images were taken elsewhere.
+    The seventh column is the shift of the camera's clock: later images were taken elsewhere. Then follows what is common to all poses.
     """
     priors = block.priors
-    by = np.zeros((len(priors), POSE, POSE + 1))
+    by = np.zeros((len(priors), POSE, 2 * POSE + 2))
     arm = np.einsum("kij,kj->ki", block.stations.mat_local_ins[priors.station], priors.arm_m)
     by[:, :3, :3], by[:, :3, 3:6], by[:, 3:, 3:6] = np.eye(3), -cross_matrix(arm), np.eye(3)
-    by[:, :3, 6], by[:, 3:, 6] = -priors.velocity_m_s, -priors.turning_rad_s
+    by[:, :3, 6], by[:, 3:, 6], by[:, 3:, 7] = -priors.velocity_m_s, -priors.turning_rad_s, -priors.turning_rad_s
+    by[:, :3, 8:11], by[:, 3:, 11:] = np.eye(3), np.eye(3)
+    by[:, :3, 11:] = -cross_matrix(priors.place_m - priors.common.centre_m)
     lead = block.stations.lead[priors.station]
     shift = unknowns.camera[lead, lenses.FREE + MOUNTING.index("timeshift")]
-    columns = np.concatenate([unknowns.station[priors.station], shift[:, None]], axis=1)
+    common = np.tile(unknowns.common, (len(priors), 1))
+    columns = np.concatenate([unknowns.station[priors.station], shift[:, None], common], axis=1)
     return pose_residuals(block, priors), by, columns
 
 
 def pose_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
     """Rows of observed poses with independent errors of unit size: residuals, derivatives, columns.
 
-    Where errors last, a row is what is new against the pose before (a Markov process), whose seven columns follow.
+    Where errors last, a row is what is new against the pose before (a Markov process), whose columns follow.
     """
     priors = block.priors
     residual, by, columns = bare_rows(block, unknowns)
@@ -74,6 +79,18 @@ def what_is_new(before: Ints, keep: Array, residual: Array, by: Array, columns: 
     new = scale * (residual - kept * residual[last])
     both = np.concatenate([scale[:, :, None] * by, -(scale * kept)[:, :, None] * by[last]], axis=2)
     return new, both, np.concatenate([columns, np.where((before >= 0)[:, None], columns[last], -1)], axis=1)
+
+
+def common_rows(block: Block, unknowns: Unknowns) -> tuple[Array, Array, Ints]:
+    """Rows of what is known of the trajectory as a whole, of unit size: residuals (1, 7), derivatives (1, 7, 7), columns (1, 7)."""
+    given = block.priors.common
+    by = np.zeros((1 + POSE, 1 + POSE))
+    if given.late_sigma_s > 0.0:
+        by[0, 0] = 1.0 / given.late_sigma_s
+    if given.covariance is not None:
+        by[1:, 1:] = np.linalg.inv(np.linalg.cholesky(given.covariance))
+    residual = by @ np.append(given.late_s, given.moved)
+    return residual[None], by[None], unknowns.common[None]
 
 
 def known_rows(block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns) -> tuple[Array, Array, Ints]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.imagery import lenses
-from groundproc.imagery.bundle.block import Block
+from groundproc.imagery.bundle.block import LIDAR, Block
 from groundproc.imagery.bundle.unknowns import OF_CAMERA, Unknowns
 
 Array = npt.NDArray[np.float64]
@@ -46,10 +46,20 @@ class System(NamedTuple):
     row_normal: Array
     row_target_m: Array
     row_root_weight: Array
+    row_moves: Mask
+    centre_m: Array
+    moved: Array
     station_column: Ints
     camera_column: Ints
+    common_column: Ints
     first: Ints
     first_row: Ints
+
+
+def moves_with_poses(block: Block) -> Mask:
+    """Which rows of points are planes of a cloud that is off as the trajectory is, shape (m,)."""
+    common = block.priors.common
+    return np.asarray((block.rows.source == LIDAR) & (common.cloud and common.covariance is not None))
 
 
 def system_of(block: Block, unknowns: Unknowns) -> System:
@@ -79,8 +89,12 @@ def system_of(block: Block, unknowns: Unknowns) -> System:
         rows.normal,
         rows.target_m,
         np.sqrt(rows.weight) / rows.sigma_m,
+        moves_with_poses(block),
+        block.priors.common.centre_m,
+        block.priors.common.moved,
         unknowns.station,
         unknowns.camera,
+        unknowns.common[1:],
         np.searchsorted(measured.point, ends),
         np.searchsorted(rows.point, ends),
     )

@@ -42,26 +42,23 @@ class Eliminated(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _known_of_point(system: System, p: int, point: Array, own: Array) -> None:
-    """Add what is known of a point without images."""
-    for i in range(system.first_row[p], system.first_row[p + 1]):
-        weight = system.row_root_weight[i]
-        left = -system.row_target_m[i]
-        for k in range(3):
-            left += system.row_normal[i, k] * point[k]
-        for j in range(3):
-            for k in range(3):
-                own[j, k] += weight * weight * system.row_normal[i, j] * system.row_normal[i, k]
-            own[j, 3] += weight * weight * system.row_normal[i, j] * left
-
-
-@njit(cache=True, nogil=True)
 def _column_at(columns: Ints, count: int, column: int) -> int:
     """Place of a column among those of a point; `count` where it is new."""
     for k in range(count):
         if columns[k] == column:
             return k
     return count
+
+
+@njit(cache=True, nogil=True)
+def _new_column(columns: Ints, count: int, column: int, mixed: Array, camera_side: Array) -> int:
+    """One more column of a point, empty; how many there are then."""
+    columns[count] = column
+    mixed[count] = 0.0
+    camera_side[count, : count + 1] = 0.0
+    camera_side[: count + 1, count] = 0.0
+    camera_side[count, -1] = 0.0
+    return count + 1
 
 
 @njit(cache=True, nogil=True)
@@ -80,6 +77,37 @@ def _add_row(
         for k in range(3):
             own[j, k] += by_point[j] * by_point[k]
         own[j, 3] += by_point[j] * residual
+
+
+@njit(cache=True, nogil=True)
+def _known_of_point(
+    system: System, p: int, point: Array, columns: Ints, count: int, mixed: Array, own: Array, camera_side: Array
+) -> int:
+    """Add what is known of a point without images; how many columns its rows have then."""
+    value, place = np.zeros(_POSE), np.empty(_POSE, np.int64)
+    normal, arm = np.empty(3), np.empty(3)
+    for i in range(system.first_row[p], system.first_row[p + 1]):
+        weight = system.row_root_weight[i]
+        left = -system.row_target_m[i] * weight
+        for k in range(3):
+            normal[k] = weight * system.row_normal[i, k]
+            left += normal[k] * point[k]
+            arm[k] = point[k] - system.centre_m[k]
+        used = 0
+        if system.row_moves[i] and weight > 0.0:
+            # the plane is shifted and turned with all of the cloud
+            used = _POSE
+            for k in range(3):
+                a, b = (k + 1) % 3, (k + 2) % 3
+                value[k] = normal[k]
+                value[3 + k] = arm[a] * normal[b] - arm[b] * normal[a]
+            for k in range(_POSE):
+                left += value[k] * system.moved[k]
+                place[k] = _column_at(columns, count, system.common_column[k])
+                if place[k] == count:
+                    count = _new_column(columns, count, system.common_column[k], mixed, camera_side)
+        _add_row(value[:used], normal, left, place[:used], mixed, own, camera_side)
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -108,20 +136,14 @@ def _point_system(
                 continue
             at = _column_at(columns, count, column)
             if at == count:
-                columns[at] = column
-                mixed[at] = 0.0
-                camera_side[at, : count + 1] = 0.0
-                camera_side[: count + 1, at] = 0.0
-                camera_side[at, -1] = 0.0
-                count += 1
+                count = _new_column(columns, count, column, mixed, camera_side)
             place[used] = at
             for a in range(2):
                 value[a, used] = by_pose[a, j] if j < _POSE else by_camera[a, j - _POSE]
             used += 1
         for a in range(2):
             _add_row(value[a, :used], by_point[a], residual[a], place[:used], mixed, own, camera_side)
-    _known_of_point(system, p, point, own)
-    return count
+    return int(_known_of_point(system, p, point, columns, count, mixed, own, camera_side))
 
 
 @njit(cache=True, nogil=True)
@@ -147,7 +169,7 @@ def widest(system: System) -> int:
     most = 0
     for p in range(len(system.first) - 1):
         most = max(most, system.first[p + 1] - system.first[p])
-    return int(most * _POSE + np.count_nonzero(system.camera_column >= 0))
+    return int(most * _POSE + np.count_nonzero(system.camera_column >= 0) + np.count_nonzero(system.common_column >= 0))
 
 
 @njit(cache=True, nogil=True)

@@ -10,8 +10,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from flightlog.errors import CoverageError
 from groundproc.imagery import lenses
 from groundproc.imagery.bundle.block import Block, Stations
-from groundproc.imagery.bundle.observed import add_dense, known_rows, pose_rows
-from groundproc.imagery.bundle.rows import System, residuals, system_of
+from groundproc.imagery.bundle.observed import add_dense, common_rows, known_rows, pose_rows
+from groundproc.imagery.bundle.rows import System, moves_with_poses, residuals, system_of
 from groundproc.imagery.bundle.schur import Eliminated, back, nothing_kept, reduce
 from groundproc.imagery.bundle.unknowns import Unknowns, lay_out, lens_names
 from groundproc.imagery.rig import MOUNTING, Rig, RigCamera
@@ -153,6 +153,7 @@ def normal_of(block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns, da
     reduce(system, block.points_m, damping, matrix, gradient, kept)
     if len(block.priors):
         add_dense(matrix, gradient, *pose_rows(block, unknowns))
+        add_dense(matrix, gradient, *common_rows(block, unknowns))
     residual, weight, columns = known_rows(block, known, unknowns)
     matrix[columns, columns] += weight**2
     gradient[columns] += weight * residual
@@ -190,10 +191,17 @@ def moved_by(block: Block, unknowns: Unknowns, step: Array, points_m: Array) -> 
             [new.timeshift_s - old.timeshift_s for new, old in zip(cameras, block.rig.cameras, strict=True)]
         )
         seconds = later[stations.lead[priors.station]][:, None]
+        common = np.where(unknowns.common >= 0, step[np.maximum(unknowns.common, 0)], 0.0)
+        turned = (seconds + common[0]) * priors.turning_rad_s
         priors = replace(
             priors,
             place_m=priors.place_m + seconds * priors.velocity_m_s,
-            mat_local_ins=mat_of_vector(seconds * priors.turning_rad_s) @ priors.mat_local_ins,
+            mat_local_ins=mat_of_vector(turned) @ priors.mat_local_ins,
+            common=replace(
+                priors.common,
+                late_s=float(priors.common.late_s + common[0]),
+                moved=priors.common.moved + common[1:],
+            ),
         )
     return replace(block, rig=Rig(cameras), stations=stations, priors=priors, points_m=block.points_m + points_m)
 
@@ -227,8 +235,10 @@ def image_residuals(block: Block, unknowns: Unknowns) -> tuple[Array, Mask]:
 
 def row_residuals(block: Block) -> Array:
     """Residual of what is known of points without images [m], shape (m,)."""
-    rows = block.rows
-    return np.asarray(np.einsum("mi,mi->m", rows.normal, block.points_m[rows.point]) - rows.target_m)
+    rows, common = block.rows, block.priors.common
+    places = block.points_m[rows.point]
+    moved = np.where(moves_with_poses(block)[:, None], common.shift_m(places), 0.0)
+    return np.asarray(np.einsum("mi,mi->m", rows.normal, places + moved) - rows.target_m)
 
 
 def cost(block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns) -> float:
@@ -239,6 +249,7 @@ def cost(block: Block, known: tuple[RigCamera, ...], unknowns: Unknowns) -> floa
     total += float((block.rows.weight * np.square(row_residuals(block) / block.rows.sigma_m)).sum())
     if len(block.priors):
         total += float(np.square(pose_rows(block, unknowns)[0]).sum())
+        total += float(np.square(common_rows(block, unknowns)[0]).sum())
     return total + float(np.square(known_rows(block, known, unknowns)[0]).sum())
 
 

@@ -1,6 +1,6 @@
 """Which columns the unknowns of a block have, points apart."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -31,12 +31,15 @@ class Unknowns:
     size : int
     datum : str
         How it lies in space: "observed", or which values are held.
+    common : ndarray of int64, shape (7,)
+        Lateness of the trajectory's attitudes, then shift and turn of the trajectory as a whole.
     """
 
     station: Ints
     camera: Ints
     size: int
     datum: str
+    common: Ints = field(default_factory=lambda: np.full(1 + POSE, -1))
 
     def names_of(self, camera: int, names: tuple[str, ...]) -> tuple[tuple[str, ...], Ints]:
         """Names of a camera's unknowns and their columns; `names` are those of its lens vector's places."""
@@ -83,7 +86,10 @@ def lay_out(block: Block) -> Unknowns:
         camera[number, places] = size + np.arange(len(places))
         size += len(places)
     size = _share_clocks(block, camera, size)
-    return Unknowns(columns, camera, size, datum)
+    given = block.priors.common
+    shared = np.array([given.late_sigma_s > 0.0, *[given.covariance is not None] * POSE]) & bool(len(block.priors))
+    common = np.where(shared, size + np.cumsum(shared) - 1, -1)
+    return Unknowns(columns, camera, size + int(shared.sum()), datum, common)
 
 
 def _share_clocks(block: Block, camera: Ints, size: int) -> int:
