@@ -21,6 +21,7 @@ from groundproc.analysis.deformation.surface import Task as SurfaceTask
 from groundproc.analysis.epochs import Epochs, Progress, agreed_crs, laid
 from groundproc.cloud import reader
 from groundproc.cloud.merger import Merger
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Found, Tiles, side_for
 from groundproc.files import made_folder, written_aside
 from groundproc.radiometry.sensorpath import SensorPath, flown, recovered
@@ -95,7 +96,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     else:
         seen = (recovered(clouds[0]), recovered(clouds[1]))
         paths = seen if None not in seen else paths
-    epochs = laid(clouds, paths, task.registered, progress)
+    epochs = laid(clouds, paths, task.registered, progress, (task.trajectory_a, task.trajectory_b))
     per_m2 = epochs.per_m2
     edge = task.voxel_m or float(np.clip(_PER_EDGE / np.sqrt(per_m2), _SMALLEST_M, _LARGEST_M))
     rule = Rule(edge, task.sway_m if task.sway_m is not None else max(0.25, 2.0 * edge), epochs.registration, per_m2)
@@ -169,7 +170,7 @@ def _told(epochs: Epochs, rule: Rule, claims: list[tuple[str, Claim]]) -> dict[s
         "appeared": kinds.count("appeared"), "vanished": kinds.count("vanished"),
         "appeared_m3": sum(c.volume_m3 for kind, c in claims if kind == "appeared"),
         "vanished_m3": sum(c.volume_m3 for kind, c in claims if kind == "vanished"),
-        "voxel_m": rule.edge_m, "sway_m": rule.sway_m, "points_per_m2": epochs.per_m2,
+        "warnings": unstated(*epochs.clouds), "voxel_m": rule.edge_m, "sway_m": rule.sway_m, "points_per_m2": epochs.per_m2,
         "unseen_by": "points behind, as seen from above" if epochs.paths[0] is None else f"beams, the sensor {epochs.paths[0].source}",
         "registration": {
             "matrix": registration.matrix.tolist(), "about_m": registration.about_m.tolist(), "sigma_m": sigma[:3].tolist(),

@@ -20,6 +20,7 @@ from groundproc.analysis.detection.layers import Layers
 from groundproc.analysis.detection.targets import SIZES_M, scan, top_m
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -114,6 +115,7 @@ def work(task: Task, progress: Progress) -> Made:
                     out.write(
                         record, columns={"hag": above, "object": _numbers(made.bodies, xyz, above, task.highest_m)}
                     )
+    made.warnings += unstated(cloud)
     if made.blind > 0.5:
         made.warnings.append(
             f"over {made.blind:.0%} of the area too few pulses came down to claim anything; --penetration shows where"

@@ -21,6 +21,7 @@ from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis.epochs import Epochs, laid
 from groundproc.analysis.registration import register
 from groundproc.cloud import reader
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tile, Tiles, side_for
 from groundproc.files import written_aside
 from groundproc.numerics.normals import normals
@@ -41,6 +42,8 @@ _LEAST_RELIEF_RAD: Final = 0.03
 """... and this."""
 _LEAST_GROUPS: Final = 8.0
 """Fewer tell no covariance of six unknowns."""
+_ROUNDED_M: Final = 1e-4
+"""No coordinate is written better: a cloud against itself has no other error."""
 _UNTOLD_M: Final = 0.5
 """A direction whose sigma is that large was not told by the relief."""
 
@@ -96,7 +99,8 @@ class Vector:
         """Whether it moved, at 95 %: by Hotelling's test, as the covariance is told from a few groups only."""
         free = self.groups - 1
         level = 3.0 * free / (free - 2) * f.ppf(0.95, 3, free - 2)
-        return bool(self.moved_m @ np.linalg.solve(self.covariance, self.moved_m) > level)
+        covariance = self.covariance + _ROUNDED_M**2 * np.eye(3)
+        return bool(self.moved_m @ np.linalg.solve(covariance, self.moved_m) > level)
 
 
 @dataclass(slots=True)
@@ -133,6 +137,7 @@ def work(task: Task, progress: Progress) -> Made:
     clouds = (reader.look(task.a), reader.look(task.b))
     epochs = laid(clouds, (None, None), task.registered, lambda stage, count: progress(count))
     made = Made(None if task.registered else epochs.registration.sigma_m)
+    made.warnings += unstated(*clouds)
     shift = np.zeros((3, 3)) if task.registered else epochs.registration.covariance[:3, :3]
     with written_aside(task.output) as aside:
         for tile in _tiles(task, epochs, progress):

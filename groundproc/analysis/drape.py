@@ -18,7 +18,7 @@ from flightlog.errors import CoverageError, GeodesyError, UsageError
 from groundproc.analysis.spectra import Library, read_library, wavelengths
 from groundproc.cloud import reader
 from groundproc.cloud.dimensions import dimension
-from groundproc.cloud.metres import metres_of
+from groundproc.cloud.metres import Raster, metres_of, unstated
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Found, Tiles, side_for
 from groundproc.files import written_aside
@@ -95,7 +95,7 @@ def work(task: Task, progress: Progress) -> Made:
     with opened_bands(task.raster) as bands, written_aside(task.output) as aside:
         library = _library(task, bands)
         _check_names(task, bands)
-        made = Made(cloud.points, bands.count)
+        made = Made(cloud.points, bands.count, warnings=unstated(cloud, Raster(task.raster, bands.crs)))
         if library is not None:
             made.materials = dict.fromkeys(library.names, 0)
         added = (*task.names, *(SPECTRAL if library is not None else ()))

@@ -2,20 +2,24 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import pyproj
 
-from flightlog.errors import GeodesyError
+from flightlog.errors import CoverageError, GeodesyError
 from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
 from groundproc.cloud.metres import metres_of
 from groundproc.cloud.reader import Chunk, Cloud
-from groundproc.radiometry.sensorpath import SensorPath
+from groundproc.radiometry.sensorpath import Flown, SensorPath, Tally
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, int], object]
+
+_SQUARE_M: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +39,8 @@ class Epochs:
         The later on the earlier.
     registered : bool
         They were taken as they are; the registration is none.
+    trajectories : tuple of 2 (Path or None)
+        Files that the paths are of.
     """
 
     clouds: tuple[Cloud, Cloud]
@@ -44,6 +50,7 @@ class Epochs:
     per_m2: float
     registration: Registration
     registered: bool
+    trajectories: tuple[Path | None, Path | None] = (None, None)
 
     @property
     def crs(self) -> pyproj.CRS | None:
@@ -52,16 +59,38 @@ class Epochs:
 
     def chunks(self, number: int, columns: tuple[str, ...] = ()) -> Iterator[tuple[Chunk, Array, Array]]:
         """Chunks of an epoch, their places in the frame of A, and the way from them to the sensor (0: not known)."""
-        path = self.paths[number]
+        path, trajectory = self.paths[number], self.trajectories[number]
+        tally = (
+            Tally(trajectory, path, self.clouds[number]) if trajectory is not None and isinstance(path, Flown) else None
+        )
         for chunk in reader.chunks(self.clouds[number], None if path is None else path.clock, columns):
             xyz = chunk.points.xyz_m
             away = np.zeros((len(xyz), 3))
             if path is not None:
                 place, known = path.at(chunk)
                 away[known] = (place - xyz)[known]
+                if tally is not None:
+                    tally.add(away, known)
             if number == 1:
                 xyz, away = self.registration.move(xyz), away @ self.registration.matrix[:3, :3].T
             yield chunk, xyz, away
+        if tally is not None:
+            tally.check()
+
+
+class Squares:
+    """Squares of the map that hold points of a cloud."""
+
+    def __init__(self) -> None:
+        self._held: set[tuple[float, float]] = set()
+
+    def add(self, xyz_m: Array) -> None:
+        """Take points, shape (n, 3)."""
+        self._held.update(map(tuple, np.unique(np.floor(xyz_m[:, :2] / _SQUARE_M), axis=0).tolist()))
+
+    def meet(self, other: "Squares") -> bool:
+        """Whether one of them is a square of another cloud, or next to one."""
+        return any((i + a, j + b) in other._held for i, j in self._held for a in (-1, 0, 1) for b in (-1, 0, 1))
 
 
 def laid(
@@ -69,6 +98,7 @@ def laid(
     paths: tuple[SensorPath | None, SensorPath | None],
     registered: bool,
     progress: Progress,
+    trajectories: tuple[Path | None, Path | None] = (None, None),
 ) -> Epochs:
     """Look at both, and lay the later one on the earlier unless they lie so already.
 
@@ -87,8 +117,8 @@ def laid(
             )
     samples, low, high, per_m2 = _look(clouds, progress)
     what = f"{clouds[0].path} and {clouds[1].path}"
-    found = _unmoved(samples) if registered else register(samples[0], samples[1], what)
-    return Epochs(clouds, paths, low, high, per_m2, found, registered)
+    found = _unmoved(samples, what) if registered else register(samples[0], samples[1], what)
+    return Epochs(clouds, paths, low, high, per_m2, found, registered, trajectories)
 
 
 def agreed_crs(clouds: tuple[Cloud, Cloud]) -> pyproj.CRS | None:
@@ -124,5 +154,12 @@ def _look(clouds: tuple[Cloud, Cloud], progress: Progress) -> tuple[list[Array],
     return samples, low, high, min(density)
 
 
-def _unmoved(samples: list[Array]) -> Registration:
+def _unmoved(samples: list[Array], what: str) -> Registration:
+    a, b = Squares(), Squares()
+    a.add(samples[0])
+    b.add(samples[1])
+    if not b.meet(a):
+        raise CoverageError(
+            f"{what}: have no place in common, expected clouds that lie on each other; are they of one place?"
+        )
     return Registration(np.eye(4), samples[0].mean(axis=0), np.zeros((6, 6)), 0.0, 1.0, 1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CoverageError, GeodesyError
+from groundproc.analysis.epochs import Squares
 from groundproc.analysis.placesearch import Found, search
 from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
@@ -69,11 +70,18 @@ def fuse(
         for cloud in clouds[1:]:
             laid.append(_laid(cloud, base, _sample(cloud, progress), f"{first.path} and {cloud.path}", searched))
     with written_aside(output) as aside, Merger(clouds, aside, ("epoch",)) as merged:
+        squares: list[Squares] = [Squares() for _ in clouds]
         for number, (cloud, each) in enumerate(zip(clouds, laid, strict=True)):
             for chunk in reader.chunks(cloud, columns=()):
                 moved = None if each.registration is None else each.registration.move(chunk.points.xyz_m)
                 merged.write(chunk.record, {"epoch": np.full(len(chunk.points), number, np.uint8)}, moved)
+                squares[number].add(chunk.points.xyz_m if moved is None else moved)
                 progress(len(chunk.points))
+            if not squares[number].meet(squares[0]):
+                raise CoverageError(
+                    f"{first.path} and {cloud.path}: have no place in common, expected clouds that lie on each other; `swath merge` puts "
+                    "neighbours into one file"
+                )
     return laid
 
 

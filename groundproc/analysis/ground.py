@@ -37,6 +37,7 @@ from groundproc.cloud.classes import (
     WATER,
     merged,
 )
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -152,7 +153,11 @@ class _Area:
         self.terrain, self.sigma = Sheet(self.grid, folder), Sheet(self.grid, folder)
         self.canopy, self.roof = Sheet(self.grid, folder), Sheet(self.grid, folder, np.uint8)
         self.seen = Sheet(self.grid, folder, np.uint8)
-        water = None if self.task.water is None else read_water(self.task.water, self.floor.cloud, self.floor.metres)
+        water = (
+            None
+            if self.task.water is None
+            else read_water(self.task.water, self.floor.cloud, self.floor.metres, self._bounds_m())
+        )
         halo = round(FILL_M / cell_m)
         for number, (block, around, cut) in enumerate(blocks(self.grid, halo)):
             base = self.floor.base.window(around)
@@ -179,6 +184,11 @@ class _Area:
             away = distance_transform_edt(~measured) if measured.any() else np.full(base.shape, np.inf)
             self.sigma.put(block, np.where(cut(measured), -cut(_of_mean(ground, around)), cut(away)).astype(np.float32))
         self.water = water
+
+    def _bounds_m(self) -> tuple[float, float, float, float]:
+        grid = self.grid
+        east, south = grid.west_m + grid.columns * grid.cell_m, grid.north_m - grid.rows * grid.cell_m
+        return grid.west_m, south, east, grid.north_m
 
     def sigma_block(self, window: Window) -> npt.NDArray[Any]:
         """Sigma of heights of the terrain model [m]: kept as less than 0 where measured, else as the distance to what is.
@@ -228,6 +238,7 @@ def work(task: Task, progress: Progress) -> Made:
                 kind = merged(record.classification, kind)
                 area.made.classes.update(dict(zip(*_counted(kind), strict=True)))
                 out.write(record, columns={"classification": kind, "hag": hag})
+    area.made.warnings += unstated(cloud)
     if not area.made.classes[GROUND]:
         area.made.warnings.append("no ground was found")
     if area.made.holdout.rmse_m is None:

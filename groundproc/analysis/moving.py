@@ -18,7 +18,7 @@ from groundproc.analysis.tracks import Burst, Track, bursts, tracks
 from groundproc.cloud import reader
 from groundproc.cloud.classes import MOVING
 from groundproc.cloud.gpstime import Clock
-from groundproc.cloud.metres import metres_of
+from groundproc.cloud.metres import metres_of, unstated
 from groundproc.files import written_aside
 from groundproc.vectors.features import Features, write_features
 
@@ -103,6 +103,7 @@ def work(task: Task, progress: Progress) -> Made:
     if not cloud.timed:
         raise CaptureError(f"{cloud.path}: its points have no gps_time, expected the time of each point")
     made, metres = Made(), metres_of(cloud)
+    made.warnings += unstated(cloud)
     time_ns, xyz = _points(cloud, task.week, progress)
     made.points = len(time_ns)
     start_ns = int(time_ns[0]) if len(time_ns) else 0

@@ -22,6 +22,7 @@ from groundproc.analysis.terrain.floor import Floor
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.cloud import reader
 from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE
+from groundproc.cloud.metres import unstated
 from groundproc.files import made_folder, written_aside
 from groundproc.raster import geotiff
 from groundproc.raster.cells import Cells
@@ -271,6 +272,7 @@ def work(task: Task, progress: Progress) -> Made:
         floor = Floor(cloud, task.folder, progress)
         area = _Area(task, floor)
         made = Made(area.grid.cell_m, task.vehicle, cloud.points, area.areas())
+        made.warnings += unstated(cloud)
         route = None if task.ends is None else area.route()
         _write_rasters(task.folder, area)
         if route is not None:

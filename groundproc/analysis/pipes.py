@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from groundproc.analysis.corridor.cylinder import Cylinder, cylinder
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tile, Tiles, side_for
 from groundproc.files import written_aside
 from groundproc.vectors.features import Features, write_features
@@ -146,6 +147,7 @@ def work(task: Task, progress: Progress) -> Made:
                 made.pipes.append(pipe)
         made.pipes.sort(key=lambda each: -each.length_m)
         _write(aside, task.output.suffix, floor, made.pipes)
+    made.warnings += unstated(cloud)
     if not made.pipes:
         made.warnings.append("no pipe was found")
     return made

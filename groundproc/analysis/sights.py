@@ -14,6 +14,8 @@ from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis import voxelsight
 from groundproc.analysis.viewshed import EXACT, FAST, UNKNOWN, VISIBLE, Sight, bend_per_m, height_at, viewshed
 from groundproc.cloud import reader
+from groundproc.cloud.metres import Raster, unstated
+from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -21,7 +23,6 @@ from groundproc.raster.cells import Cells
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
 from groundproc.raster.relief import filled
-from groundproc.raster.work import common_crs
 from groundproc.vectors.features import read_features
 
 Array = npt.NDArray[np.float64]
@@ -147,10 +148,17 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
         with geotiff.opened(task.source) as raster:
             _check_size(raster.grid)
             heights = raster.window(raster.grid)
-            return Surface(heights, raster.west_m, raster.north_m, raster.grid, raster.crs)
+            return Surface(
+                heights,
+                raster.west_m,
+                raster.north_m,
+                raster.grid,
+                raster.crs,
+                tuple(unstated(Raster(task.source, raster.crs))),
+            )
     cell_m = checked_cell(task.cell_m or _CELL_M)
     cloud = reader.look(task.source, SURFACES)
-    crs, warnings = common_crs([cloud], None)
+    crs = agreed_crs([cloud])
     cells = Cells(cell_m, {"max"})
     for chunk in reader.chunks(cloud, columns=()):
         cells.add(chunk.points.xyz_m, chunk.points.xyz_m[:, 2])
@@ -160,7 +168,7 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
         raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
     _check_size(grid)
     heights = filled(cells.window(grid, "max"), max(round(_GAP_M / cell_m), 1))
-    return Surface(heights, grid.west_m, grid.north_m, grid, crs, warnings)
+    return Surface(heights, grid.west_m, grid.north_m, grid, crs, tuple(unstated(cloud)))
 
 
 def _check_size(grid: Grid) -> None:

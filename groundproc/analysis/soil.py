@@ -21,6 +21,7 @@ from groundproc.analysis.terrain.building import outlines
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
 from groundproc.cloud.classes import GROUND, NO_SURFACE, PANE
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tile, Tiles, side_for
 from groundproc.files import written_aside
 from groundproc.raster.grid import Grid
@@ -128,7 +129,7 @@ def work(task: Task, progress: Progress) -> Made:
     later = reader.look(task.cloud)
     clouds = [later] if task.before is None else [reader.look(task.before), later]
     strength = next((name for name in _STRENGTHS if all(name in each.columns for each in clouds)), None)
-    made = Made(strength)
+    made = Made(strength, warnings=unstated(*clouds))
     with written_aside(task.output) as aside:
         floor = Floor(clouds[0], task.output.parent, progress)
         tiles = _ground(task, clouds, floor, strength, made)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from groundproc.analysis.crowns import Tree, crowns, dead
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tiles, side_for
 from groundproc.files import written_aside
 from groundproc.vectors.features import Features, write_features
@@ -92,6 +93,7 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
         made.trees.sort(key=lambda each: (each.y, each.x))
         made.dead = dead(made.trees)
         _write(aside, task.output.suffix, floor, made)
+    made.warnings += unstated(cloud)
     if not made.trees:
         made.warnings.append(f"nothing grows higher than {task.least_m:g} m")
     return made

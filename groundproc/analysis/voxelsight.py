@@ -14,13 +14,14 @@ from numba import njit
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.metres import unstated
+from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.radiometry import sensorpath
 from groundproc.raster import geotiff
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
-from groundproc.raster.work import common_crs
 
 if TYPE_CHECKING:
     from groundproc.analysis.sights import Task
@@ -42,7 +43,7 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
         raise UsageError(f"{task.source}: is a raster; --mode voxels looks through a cloud")
     edge_m = checked_cell(task.cell_m or _EDGE_M)
     cloud = reader.look(task.source, SURFACES)
-    crs, warnings = common_crs([cloud], None)
+    crs = agreed_crs([cloud])
     path = None if task.trajectory is None else sensorpath.flown([cloud], task.trajectory)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for chunk in reader.chunks(cloud, columns=()):
@@ -57,19 +58,7 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
             f"{task.source}: {shape[0]} x {shape[1]} x {shape[2]} voxels of {edge_m:g} m found, expected at most {_MOST:,}; choose a "
             "larger --cell, or cut out the part of interest with `swath section`"
         )
-    hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
-    ground = np.full((shape[0], shape[1]), np.inf)
-    for chunk in reader.chunks(cloud, None if path is None else path.clock, ()):
-        local = chunk.points.xyz_m / edge_m - first
-        if path is None:
-            away, known = np.tile([0.0, 0.0, 1.0], (len(local), 1)) * float(shape[2] + 1), np.ones(len(local), np.bool_)
-        else:
-            sensor, known = path.at(chunk)
-            away = sensor / edge_m - first - local
-        last = np.asarray(chunk.record.return_number) >= np.asarray(chunk.record.number_of_returns)
-        _beams(local[known], away[known], last[known], hits, passes)
-        _lowest(local, chunk.points.xyz_m[:, 2], ground)
-        progress(len(chunk.points))
+    hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m), progress)
     through = np.ones(shape, np.float32)
     met = hits + passes
     np.divide(passes, met, out=through, where=met > 0)
@@ -95,8 +84,38 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
     seen = np.isfinite(image)
     return {
         "mode": task.mode, "places": len(places), "cells": int(image.size), "unknown_cells": int((~seen).sum()),
-        "mean_transmittance": float(image[seen].mean()) if seen.any() else None, "warnings": list(warnings),
+        "mean_transmittance": float(image[seen].mean()) if seen.any() else None, "warnings": unstated(cloud),
     }  # fmt: skip
+
+
+def _met(
+    task: "Task",
+    cloud: reader.Cloud,
+    path: sensorpath.Flown | None,
+    voxels: tuple[Any, Any, float],
+    progress: Callable[[int], object],
+) -> tuple[Any, Any, Array]:
+    """Beams that ended in each voxel and that went through, and the lowest point of each column; voxels by their first, shape and edge."""
+    first, shape, edge_m = voxels
+    hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+    ground = np.full((shape[0], shape[1]), np.inf)
+    tally = None if path is None or task.trajectory is None else sensorpath.Tally(task.trajectory, path, cloud)
+    for chunk in reader.chunks(cloud, None if path is None else path.clock, ()):
+        local = chunk.points.xyz_m / edge_m - first
+        if path is None:
+            away, known = np.tile([0.0, 0.0, 1.0], (len(local), 1)) * float(shape[2] + 1), np.ones(len(local), np.bool_)
+        else:
+            sensor, known = path.at(chunk)
+            away = sensor / edge_m - first - local
+            if tally is not None:
+                tally.add(away * edge_m, known)
+        last = np.asarray(chunk.record.return_number) >= np.asarray(chunk.record.number_of_returns)
+        _beams(local[known], away[known], last[known], hits, passes)
+        _lowest(local, chunk.points.xyz_m[:, 2], ground)
+        progress(len(chunk.points))
+    if tally is not None:
+        tally.check()
+    return hits, passes, ground
 
 
 def _places(task: "Task", crs: Any, ground: Array, first: Any, edge_m: float) -> list[tuple[float, float]]:

@@ -17,16 +17,16 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from flightlog.errors import CoverageError
 from groundproc.analysis.facades import Facade, facades
 from groundproc.analysis.indoors import Tops, indoors, outer_walls
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
 from groundproc.cloud.classes import PANE, merged
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Found, Tile, Tiles, side_for
 from groundproc.files import written_aside
-from groundproc.radiometry.sensorpath import SensorPath, flown, recovered
+from groundproc.radiometry.sensorpath import Flown, SensorPath, Tally, flown, recovered
 from groundproc.vectors.features import Features, write_features
 
 Array = npt.NDArray[np.float64]
@@ -132,6 +132,7 @@ def work(task: Task, progress: Progress) -> Made:
         if task.walls is not None:
             with written_aside(task.walls) as other:
                 _write_walls(other, task.walls.suffix, floor, made.walls)
+    made.warnings += unstated(cloud)
     if not made.walls:
         made.warnings.append("no wall of a house was found")
     elif path is None:
@@ -154,24 +155,24 @@ def _found(task: Task, floor: Floor, path: SensorPath | None, made: Made) -> Fou
     """1 for each point behind a wall, 2 on a pane."""
     grid, cloud = floor.grid, floor.cloud
     side = side_for(cloud.points, (0.0, 0.0), (grid.columns * grid.cell_m, grid.rows * grid.cell_m), _HALO_M)
-    tiles, placed = Tiles(task.output.parent, _KEPT, side, _HALO_M), 0
+    tiles = Tiles(task.output.parent, _KEPT, side, _HALO_M)
+    tally = Tally(task.trajectory, path, cloud) if task.trajectory is not None and isinstance(path, Flown) else None
     for chunk in reader.chunks(cloud, None if path is None else path.clock, ("return_number",)):
         xyz = np.ascontiguousarray(floor.metres.of(chunk.points.xyz_m))
         away = np.full((len(xyz), 3), np.nan)
         if path is not None:
             place, known = path.at(chunk)
-            placed += int(known.sum())
             away[known] = floor.metres.of(place)[known] - xyz[known]
+            if tally is not None:
+                tally.add(away, known)
         time = np.asarray(chunk.record.gps_time) if cloud.timed else np.zeros(len(xyz))
         tiles.add(xyz, {
             "above": floor.above(xyz), "east": away[:, 0], "north": away[:, 1], "up": away[:, 2], "pulse": time,
             "rank": np.asarray(chunk.record.return_number),
         })  # fmt: skip
         floor.progress(len(xyz))
-    if task.trajectory is not None and placed < cloud.points / 2:
-        raise CoverageError(
-            f"{task.trajectory}: {cloud.points - placed} of {cloud.points} points were measured when it has no pose; is it of this flight?"
-        )
+    if tally is not None:
+        tally.check()
     found = Found(task.output.parent, {"kind": "u1"}, cloud.points)
     for tile in tiles:
         kind = _of_tile(tile, made)

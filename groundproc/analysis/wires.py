@@ -38,6 +38,7 @@ from groundproc.cloud.classes import (
     UNCLASSIFIED,
     merged,
 )  # fmt: skip
+from groundproc.cloud.metres import unstated
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.tiles import Tiles, side_for
 from groundproc.files import written_aside
@@ -144,6 +145,7 @@ def work(task: Task, progress: Progress) -> Made:
             with written_aside(task.clearance) as other:
                 _write_clearance(task.clearance, other, floor, made)
         _write_lines(aside, task.output.suffix, floor, made)
+    made.warnings += unstated(cloud)
     if not made.wires:
         made.warnings.append("no wire was found")
     return made

@@ -1,14 +1,39 @@
 """Clouds in metres, whatever unit their CRS has: feet at the door become metres, and results go back into the unit of the CRS."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+import pyproj
 
 from flightlog.errors import GeodesyError
 from groundproc.cloud.reader import Cloud
 
 Array = npt.NDArray[np.float64]
+
+
+class Stating(Protocol):
+    """A file that may state a CRS."""
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        ...
+
+    @property
+    def horizontal(self) -> pyproj.CRS | None:
+        """Horizontal part of what it states."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """A raster that may state one."""
+
+    path: Path
+    horizontal: pyproj.CRS | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +67,16 @@ class Metres:
 
 
 METRES = Metres()
+
+
+def unstated(*files: Stating) -> list[str]:
+    """What the user is told of files that state no CRS."""
+    stated = next((each for each in files if each.horizontal is not None), None)
+    if stated is None:
+        why = "states no CRS: its coordinates are taken for metres, and what is made of it states none"
+    else:
+        why = f"states no CRS, and is taken to be in that of {stated.path}"
+    return [f"{path} {why}" for path in dict.fromkeys(each.path for each in files if each.horizontal is None)]
 
 
 def metres_of(cloud: Cloud) -> Metres:

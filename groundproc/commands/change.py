@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.analysis.change import FILES, Task
     from groundproc.analysis.change import run as compare
     from groundproc.analysis.deformation import surface
+    from groundproc.commands.figures import warn
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, SOLUTION_WORDS, SOLUTIONS, expect
     from groundproc.commands.outputs import claim_file, claim_folder, write_json
 
@@ -84,6 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         told = compare(task, advance)
     if arguments.json is not None:
         write_json(arguments.json, told)
+    warn(told["warnings"], sys.stderr)
     found = told["registration"]
     print(
         f"registration: residual {found['residual_m'] * 1e3:.1f} mm, sigma {max(found['sigma_m']) * 1e3:.1f} mm, "

@@ -31,6 +31,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from groundproc.analysis.fuse import fuse, told
+    from groundproc.cloud import reader
+    from groundproc.cloud.metres import unstated
+    from groundproc.commands.figures import warn
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file, write_json
 
@@ -47,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         laid = fuse(arguments.clouds, arguments.output, arguments.registered, bar.update, searched=arguments.search)
     if arguments.json is not None:
         write_json(arguments.json, {"clouds": told(laid)})
+    warn(unstated(*map(reader.look, arguments.clouds)), sys.stderr)
     for number, each in enumerate(laid):
         found = each.registration
         how = (

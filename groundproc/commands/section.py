@@ -36,6 +36,9 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from groundproc.analysis.section import CLOUD_ENDINGS, ENDINGS, section
+    from groundproc.cloud import reader
+    from groundproc.cloud.metres import unstated
+    from groundproc.commands.figures import warn
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file, write_json
     from groundproc.commands.values import numbers
@@ -59,6 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
                 draw(drawn, arguments.picture, arguments.colour)
     if arguments.json is not None:
         write_json(arguments.json, asdict(made))
+    warn(unstated(reader.look(arguments.cloud)), sys.stderr)
     print(
         f"{made.points:,} of {made.of:,} points, {made.length_m:.2f} m long, {made.lowest_m:.2f} to {made.highest_m:.2f} m high; "
         f"{arguments.output}"

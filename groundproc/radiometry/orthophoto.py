@@ -27,6 +27,7 @@ _MARGIN_CELLS: Final = 6
 _TOP_M: Final = 0.3
 """Echoes so far below the highest of a cell are under it, and not seen from above."""
 _BLOCK: Final = 512
+_STRENGTHS: Final = ("intensity", "reflectance")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,16 +65,19 @@ def orthophoto(
         if attribute not in cloud.columns:
             helps = "; `swath reflectance` makes it" if attribute == "reflectance" else ""
             raise UsageError(f"{cloud.path}: has no {attribute}, but {', '.join(cloud.columns)}{helps}")
-    tops, points = Cells(cell_m, {"max"}), 0
+    tops, points, told = Cells(cell_m, {"max"}), 0, attribute not in _STRENGTHS
     for cloud in clouds:
         for chunk in reader.chunks(cloud, columns=(attribute,)):
             good = np.isfinite(chunk.points[attribute].astype(np.float64))
+            told = told or bool(np.any(chunk.points[attribute][good]))
             tops.add(chunk.points.xyz_m[good], chunk.points.xyz_m[good, 2])
             points += len(chunk.points)
             progress(len(chunk.points))
     grid = tops.grid()
     if grid is None:
         raise CoverageError(f"{paths[0]}: not one point has a value of {attribute}")
+    if not told:
+        raise CoverageError(f"{paths[0]}: {attribute} is 0 for all points, expected the strength of each echo")
     kept = _Blocks(grid, output.parent)
     for cloud in clouds:
         for chunk in reader.chunks(cloud, columns=(attribute,)):

@@ -34,6 +34,12 @@ _LEAST_ANGLE: Final = 0.02
 """Rays of a strip have to differ by so much [rad], or they tell no height."""
 _FARTHEST_M: Final = 20_000.0
 _ROUNDS: Final = 10
+_SOME: Final = 1000
+"""Points of a chunk that tell how far the sensor is."""
+_FARTHEST_SENSOR_M: Final = 10_000.0
+_FLAT_M: Final = 500.0
+_LEAST_RISE: Final = 0.1
+"""What is farther away than _FLAT_M is seen from an aircraft, and so at no flatter an angle."""
 
 
 class SensorPath(Protocol):
@@ -115,6 +121,52 @@ def flown(
     check_area(map_crs, route.latitude_deg, route.longitude_deg)
     times = route.poses.time_ns
     return Flown(route, Clock(week, int(times[len(times) // 2])), np.asarray(lever_m, np.float64))
+
+
+class Tally:
+    """Whether a trajectory is of a cloud: counts points whose sensor it knows, and how far away that would have been.
+
+    Parameters
+    ----------
+    trajectory : Path
+    path : Flown
+    cloud : Cloud
+    """
+
+    def __init__(self, trajectory: Path, path: Flown, cloud: Cloud) -> None:
+        times = path.route.poses.time_ns
+        self._cloud, self._path, self._span = cloud.path, trajectory, span(int(times[0]), int(times[-1]))
+        self._points, self._known = 0, 0
+        self._away: list[Array] = []
+
+    def add(self, away_m: Array, known: npt.NDArray[np.bool_]) -> None:
+        """Take the way from points to the sensor, shape (n, 3), and where it is known, shape (n,)."""
+        self._points, self._known = self._points + len(known), self._known + int(known.sum())
+        step = max(1, len(known) // _SOME)
+        self._away.append(away_m[::step][known[::step]])
+
+    def check(self) -> None:
+        """See that the trajectory and the points belong together.
+
+        Raises
+        ------
+        CoverageError
+            They are of other times or of other places.
+        """
+        if self._known < self._points / 2:
+            raise CoverageError(
+                f"{self._path}: {self._points - self._known} of {self._points} points of {self._cloud} were measured when it has no pose "
+                f"({self._span}); is it of this flight?"
+            )
+        away = np.abs(np.concatenate(self._away)) if self._away else np.empty((0, 3))
+        if not len(away):
+            return
+        flat, up = float(np.median(np.hypot(away[:, 0], away[:, 1]))), float(np.median(away[:, 2]))
+        if np.hypot(flat, up) > _FARTHEST_SENSOR_M or (flat > _FLAT_M and up < _LEAST_RISE * flat):
+            raise CoverageError(
+                f"{self._path}: the sensor would have been {flat:.0f} m beside the points of {self._cloud} and {up:.0f} m above them "
+                "(median), farther than one sees; is the trajectory of this flight?"
+            )
 
 
 def span(first_ns: int, last_ns: int) -> str:

@@ -20,6 +20,7 @@ from groundproc.radiometry import report, signal
 from groundproc.radiometry.atmosphere import transmission
 from groundproc.radiometry.calibration import FEWEST, Constant, Echoes, combine, constant_of
 from groundproc.radiometry.gains import Gains, gains, speckle
+from groundproc.radiometry.sensorpath import Flown, Tally
 from groundproc.radiometry.site import STEEPEST, Progress, Sample, Site, Task, check_names, check_path, look
 from groundproc.radiometry.targets import Target
 
@@ -67,6 +68,14 @@ def _placed(site: Site, progress: Progress, stage: str) -> Iterator[tuple[Chunk,
             progress(stage, len(chunk.points))
 
 
+def _tallies(site: Site) -> list[Tally]:
+    """One a cloud, where the path is that of a trajectory."""
+    path, trajectory = site.path, site.task.trajectory
+    if trajectory is None or not isinstance(path, Flown):
+        return []
+    return [Tally(trajectory, path, cloud) for cloud in site.clouds]
+
+
 def _surfaces(site: Site, progress: Progress) -> Found:
     """Range and incidence of all points; what the constants are made of is gathered on the way."""
     survey, folder = site.survey, site.task.folder
@@ -76,13 +85,15 @@ def _surfaces(site: Site, progress: Progress) -> Found:
         side_for(survey.points, survey.low.tolist(), survey.high.tolist(), normals.HALO_M),
         normals.HALO_M,
     )
-    sample = Sample(survey.points)
+    sample, tallies = Sample(survey.points), _tallies(site)
     for chunk, number, place, known in _placed(site, progress, "placing"):
         away = place - chunk.points.xyz_m
         range_m = np.linalg.norm(away, axis=1)
         site.known += int(known.sum())
         raw = site.signal.raw(chunk.record)
         range_m[~known] = np.nan
+        if tallies:
+            tallies[number].add(away, known)
         away /= np.where(known & (range_m > 0), range_m, 1.0)[:, None]
         source = chunk.points.columns["point_source_id"]
         strength = np.where(site.good(raw), site.signal.linear(raw), np.nan)
@@ -95,6 +106,8 @@ def _surfaces(site: Site, progress: Progress) -> Found:
         })  # fmt: skip
         sample.add(raw[known], range_m[known], chunk.points.columns.get("range"), known)
     check_path(site, sample)
+    for each in tallies:
+        each.check()
     found = Found(folder, _FOUND, survey.points)
     for tile in tiles:
         lies = normals.normals(tile.xyz_m)

@@ -10,6 +10,7 @@ import rasterio.features
 import shapely
 from rasterio.transform import Affine
 
+from flightlog.errors import CoverageError
 from groundproc.cloud.metres import Metres
 from groundproc.cloud.reader import Cloud
 from groundproc.raster.grid import Window
@@ -61,12 +62,12 @@ class Water:
         return out
 
 
-def read_water(path: Path, cloud: Cloud, metres: Metres) -> Water:
-    """Polygons of a file, in the CRS of a cloud.
+def read_water(path: Path, cloud: Cloud, metres: Metres, bounds_m: tuple[float, float, float, float]) -> Water:
+    """Polygons of a file, in the CRS of a cloud that spans west, south, east, north.
 
     Raises
     ------
-    CaptureError, GeodesyError
+    CaptureError, CoverageError, GeodesyError
         It is not as it should be.
     """
     features = read_features(path, "Polygon")
@@ -79,4 +80,10 @@ def read_water(path: Path, cloud: Cloud, metres: Metres) -> Water:
             z = shapely.get_coordinates(part, include_z=True)[:, 2]
             known = np.isfinite(z) & bool(shapely.has_z(part))
             levels.append(float(np.mean(z[known])) * metres.up if known.any() else None)
+    if areas and not any(each.intersects(shapely.box(*bounds_m)) for each in areas):
+        west, south, east, north = (value / metres.across for value in bounds_m)
+        raise CoverageError(
+            f"{path}: all {len(areas)} polygons lie outside of the cloud, which spans {west:.0f} to {east:.0f} E and {south:.0f} to "
+            f"{north:.0f} N"
+        )
     return Water(areas, levels)
