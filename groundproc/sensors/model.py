@@ -28,11 +28,14 @@ class Ranging:
         Full width of the beam.
     pulse_m : float
         Length of the pulse, as the distance from which on two surfaces give two echoes.
+    pointing_rad : float
+        Of each angle of the beam as it is stated, one sigma; 0: nobody says.
     """
 
     sigma_m: float
     divergence_rad: float
     pulse_m: float
+    pointing_rad: float = 0.0
 
 
 class Lidar(Protocol):

@@ -1,5 +1,6 @@
 """A Velodyne of the family whose packets have twelve blocks: what a model's file fills in, and what follows from it."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -19,9 +20,12 @@ from groundproc.sensors.shots import Gate, LaserTable, Shots
 
 _BLANK: Final = 0
 """Return mode and product of old firmware of the HDL-32E."""
-RANGING: Final = Ranging(sigma_m=0.015, divergence_rad=2.79e-3, pulse_m=0.6)
+RANGING: Final = Ranging(
+    sigma_m=0.015, divergence_rad=2.79e-3, pulse_m=0.6, pointing_rad=math.radians(0.01) / math.sqrt(12.0)
+)
 """Ranges to 15 mm up to 55 m on a panel of 30 %, two surfaces told apart from 0.6 m: measured on an HDL-32E (FOI-R--4045--SE, appendix
-B). The width of the beam is the HDL-32E's manual's. The VLP-16's manual states 3 cm, which holds an offset of each laser."""
+B). The width of the beam is the HDL-32E's manual's, which states angles in steps of 0.01 deg. The VLP-16's manual states 3 cm, which
+holds an offset of each laser."""
 _MODES: Final = {
     int(ReturnMode.UNKNOWN): "unknown",
     int(ReturnMode.STRONGEST): "strongest",

@@ -5,19 +5,23 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import laspy
 import numpy as np
 import numpy.typing as npt
 import pytest
 from truepoints import Compared, compared
 
-from flightlog import frames
+from flightlog import frames, hdl32e
 from flightlog.mount import LidarMount, Mount
 from groundproc.accuracy.truth import read_truth
 from groundproc.cli import main
 from groundproc.cloud.pointsigma import LARGEST_M, Errors, MountErrors
+from groundproc.estimation.ins import UERE_M
 from groundproc.geodesy import LocalFrame
+from groundproc.numerics.robust import sigma
 from groundproc.sensors.model import Ranging
 from groundproc.survey import Survey
 from groundproc.trajectory.covariance import Correlation
@@ -33,6 +37,7 @@ FRAME = LocalFrame(58.394, 15.574, 61.3)
 START_NS = 1_779_272_223_000_000_000
 MOUNT = Mount(LidarMount((0.1, 0.2, -0.16), 3.0, -20.0, 2.0))
 RANGING = Ranging(0.015, 2.79e-3, 0.6)
+"""Of an HDL-32E, but that its angles are taken for exact."""
 EXACT = Ranging(1e-9, 0.0, 0.6)
 FIRM = MountErrors(np.zeros(3), np.zeros(3))
 DRAWS = 40_000
@@ -127,10 +132,44 @@ def test_range_and_footprint_move_a_point_as_draws_of_them_do(range_m: float, do
     spread = (away[:, None] * (unit + across) - range_m * unit).std(axis=0)
     trajectory = standing(np.zeros(6), np.eye(6), (0.0, 0.0, 0.0))
     origin = np.array([5.0, -3.0, 40.0]) + MOUNT.lidar_position_m()
-    told = sigma_of(trajectory, origin + range_m * unit, RANGING, slant=0.0)
+    told = sigma_of(trajectory, origin + range_m * unit, RANGING)
     # in a file a sigma is a whole number of millimetres
     assert told[0] == pytest.approx(np.sqrt(0.5 * (spread[0] ** 2 + spread[1] ** 2)), abs=0.0006, rel=0.06)
     assert told[1] == pytest.approx(spread[2], abs=0.0006, rel=0.06)
+
+
+@pytest.mark.parametrize("range_m", [10.0, 60.0])
+def test_a_surface_fills_the_beam_and_only_its_angles_err(range_m: float) -> None:
+    trajectory = standing(np.zeros(6), np.eye(6), (0.0, 0.0, 0.0))
+    origin = np.array([5.0, -3.0, 40.0]) + MOUNT.lidar_position_m()
+    steps = replace(RANGING, pointing_rad=1e-3)  # so coarse that it is seen beside the range
+    level = sigma_of(trajectory, origin + np.array([range_m, 0.0, 0.0]), steps, slant=0.0)
+    # along the beam the range, across it the angle: east, and north and up
+    assert level[0] == pytest.approx(np.sqrt(0.5 * (0.015**2 + (1e-3 * range_m) ** 2)), rel=0.06)
+    assert level[1] == pytest.approx(1e-3 * range_m, rel=0.06)
+    assert sigma_of(trajectory, origin + np.array([range_m, 0.0, 0.0]), RANGING, slant=0.0)[1] == 0.0
+
+
+def test_on_a_road_the_place_within_the_footprint_does_not_show(monterey_log: Path, tmp_path: Path) -> None:
+    """A real HDL-32E that stands: beams that meet the road at 83 deg and more, the next one beside it.
+
+    Were what answers anywhere in the footprint, ranges of neighbours would scatter by its length, a quarter of the diameter over the
+    cosine of the incidence. Second differences take away the shape of the road.
+    """
+    assert main(["decode", str(monterey_log), "-o", str(tmp_path / "m.laz"), "--fov-deg", "0-360"]) == 0
+    las = laspy.read(tmp_path / "m.laz")
+    ratios = []
+    for laser in (3, 5, 7):  # 8.0, 6.7 and 5.3 deg below the level
+        rows = np.flatnonzero(np.asarray(las.laser) == laser)
+        rows = rows[np.argsort(np.asarray(las.gps_time)[rows], kind="stable")]
+        range_m, time_s = np.asarray(las.range)[rows], np.asarray(las.gps_time)[rows]
+        second = range_m[2:] - 2 * range_m[1:-1] + range_m[:-2]
+        there = (time_s[2:] - time_s[:-2] < 250e-6) & (range_m[1:-1] > 10) & (range_m[1:-1] < 20)
+        assert there.sum() > 3000
+        scatter = sigma(second[there]) / np.sqrt(6)
+        down = np.deg2rad(-hdl32e.ELEVATION_DEG[laser])
+        ratios.append(scatter / (0.25 * RANGING.divergence_rad * np.median(range_m[1:-1][there]) / np.tan(down)))
+    assert max(ratios) < 0.2, ratios
 
 
 def test_a_slanted_surface_lengthens_the_pulse_and_so_the_noise() -> None:
@@ -168,12 +207,17 @@ def shares(found: Compared, chosen: npt.NDArray[np.bool_]) -> dict[int, tuple[fl
 
 
 def test_where_the_poses_are_the_truth_the_errors_are_those_of_the_beam(judged_flight: "Simulated") -> None:
-    """Over ranges and incidences at least 68 and 95 %: in the simulator the middle of a footprint answers, in the world any part of it."""
+    """Over ranges and incidences 68 and 95 %. What ties the clocks is not the truth: it leaves a third of a millisecond of turning."""
     whole = read_truth(judged_flight.folder)
     poses = whole.trajectory
     utc = whole.utc.shows_ns(whole.lidar.elapsed_s(poses.time_ns))
-    small = np.full((len(poses), 3), 1e-6)
-    exact = replace(poses, time_ns=utc, frame=whole.frame, sigma_position_m=small, sigma_attitude_rad=small)
+    mats = frames.mat_from_quat(poses.quat_local_ins_wxyz)
+    step_s = np.diff(poses.time_ns)[:, None] * 1e-9
+    turned = mats[:-1].transpose(0, 2, 1) @ mats[1:]
+    rate = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=1) / step_s
+    tie_rad = 0.35e-3 * np.sqrt(np.mean(np.square(rate), axis=0))
+    small, turn = np.full((len(poses), 3), 1e-6), np.tile(tie_rad, (len(poses), 1))
+    exact = replace(poses, time_ns=utc, frame=whole.frame, sigma_position_m=small, sigma_attitude_rad=turn)
     estimate = Estimate(exact, whole.mount, "the truth", mount_source="the truth", mount_sigma=None)
     found = compared(judged_flight.folder, estimate, survey=replace(Survey(), boresight_sigma_deg=0.0))
     assert len(found.points) > 100_000
@@ -184,8 +228,13 @@ def test_where_the_poses_are_the_truth_the_errors_are_those_of_the_beam(judged_f
             chosen = (found.points["range"] >= low) & (found.points["range"] < high) & (slant >= begin) & (slant < end)
             if chosen.sum() > 2000:
                 within = shares(found, chosen)
-                assert min(within[1]) > 0.66, (low, begin, within)
-                assert min(within[2]) > 0.94, (low, begin, within)
+                # sigma_h is of the mean of two axes: where all of the error is in one, 0.76 and 0.92 of both are within
+                assert 0.66 < within[1][0] < 0.78, (low, begin, within)
+                assert 0.90 < within[2][0] < 0.97, (low, begin, within)
+                # the simulator's ranges are as good on slanted surfaces: too wide beyond 30 m
+                most = (0.76, 0.98) if low < 30.0 or begin < 65 else (0.85, 0.995)
+                assert 0.66 < within[1][1] < most[0], (low, begin, within)
+                assert 0.93 < within[2][1] < most[1], (low, begin, within)
 
 
 def draws(found: Compared) -> Array:
@@ -211,9 +260,15 @@ def test_errors_of_one_flight_are_within_two_sigma(judged_flight: "Simulated") -
 def test_of_twenty_flights_two_thirds_are_within_one_sigma_and_nineteen_within_two(
     simulated: Callable[..., "Simulated"],
 ) -> None:
-    from simulator.config import MountOptions, Options
+    """The receiver states dilutions of 1.2 and 1.8, which stand for 3.0 and 4.5 m: so far off are its fixes and heights here.
 
-    options = replace(Options(), mount=MountOptions(boresight_spread_deg=1.0))
+    By default the simulated fixes are better than that, 2.0 and 1.5 m: no fault of what is made of the statement.
+    """
+    from simulator.config import InsOptions, MountOptions, Options
+
+    spread = MountOptions(boresight_spread_deg=Survey().boresight_sigma_deg * np.sqrt(3.0))  # uniform, of that sigma
+    datum = InsOptions(gnss_sigma_m=1.2 * UERE_M, height_bias_m=1.8 * UERE_M)
+    options = replace(Options(), mount=spread, ins=datum)
     every = [
         draws(flown(simulated(f"sigma{seed}", "village", 20.0, options, seed=seed, every=10, points=True), "sigma"))
         for seed in range(100, 120)
@@ -224,8 +279,8 @@ def test_of_twenty_flights_two_thirds_are_within_one_sigma_and_nineteen_within_t
             file.write(
                 json.dumps({"points_within_1_sigma": one.tolist(), "points_within_2_sigma": two.tolist()}) + "\n"
             )
-    # 20 flights are 40 draws of a horizontal axis and 20 of the height: 0.68 to 0.07 and 0.10, one sigma; too few is worse than too many
-    assert one[0] > 0.68 - 2 * 0.07
-    assert one[1] > 0.68 - 2 * 0.10
-    assert two.min() > 0.95 - 2 * 0.05
-    assert one[0] < 0.95
+    # 20 flights are 40 draws of a horizontal axis and 20 of the height: 0.68 to 0.07 and 0.10, 0.95 to 0.035 and 0.05, one sigma
+    assert one[0] == pytest.approx(0.68, abs=2 * 0.07)
+    assert one[1] == pytest.approx(0.68, abs=2 * 0.10)
+    assert two[0] > 0.95 - 2 * 0.035
+    assert two[1] > 0.95 - 2 * 0.05
