@@ -14,7 +14,7 @@ CHAPTERS: Final = {
     "after the cloud": ("export", "assess", "raster", "contours", "profile", "tin", "volume", "section", "smooth", "fuse", "merge",
         "tile", "transform"),
     "what people fly for": (
-        "ground", "trees", "wires", "pipes", "windows", "detect", "moving", "soil", "change", "displacement",
+        "ground", "trees", "wires", "pipes", "windows", "detect", "moving", "soil", "change", "displacement", "banks",
         "viewshed", "passability", "reflectance", "orthophoto",
     ),
     "images": ("images", "colour", "ortho", "ndvi", "wide", "mesh", "drape"),

@@ -7,7 +7,7 @@ from groundproc.cli import OURS, commands
 from groundproc.commands import grouped
 
 READ_ON: Final = {
-    "adjust": "methods/strips.md", "assess": "assess.md", "bag": "ros.md", "batch": "campaigns.md",
+    "adjust": "methods/strips.md", "assess": "assess.md", "bag": "ros.md", "banks": "uses/banks.md", "batch": "campaigns.md",
     "calibrate": "methods/calibration.md", "change": "uses/change.md", "colour": "imagery.md",
     "compass": "methods/dynamic.md", "completion": "tutorial.md", "contours": "clouds.md#contours", "decode": "sensors.md",
     "detect": "uses/detect.md", "displacement": "uses/displacement.md",

@@ -24,6 +24,7 @@ REGISTRY: Final[dict[str, Entry]] = {
     "detect": Entry("groundproc.uses.detect", "make", "objects.geojson: hard targets; penetration.tif: where nothing can be claimed"),
     "moving": Entry("groundproc.uses.moving", "make", "moving.geojson, ways.geojson: what moved, with time, place and speed"),
     "soil": Entry("groundproc.uses.soil", "make", "soil.geojson: patches of ground that stand out by height and reflectance"),
+    "banks": Entry("groundproc.uses.banks", "make", "banks.geojson: upper and lower edges of banks, lines of waters"),
     "passability": Entry(
         "groundproc.uses.passability", "make", "passability.tif, slope.tif, step.tif, obstacle.tif: where a vehicle can go"
     ),

@@ -1,0 +1,1 @@
+"""Banks: upper and lower edge, the line of the water, and between two epochs their retreat and the volume lost."""
