@@ -109,6 +109,8 @@ TRIALS: Final = (
     Trial("bare field", "barefield", 21, 40.0),
     *(Trial(f"facades {seed}", "facades", seed, 40.0) for seed in (21, 22)),
     Trial("facades, slowly", "facades", 31, 60.0, changes="flight: {speed_m_s: 3.3}"),
+    *(Trial(f"avenue {seed}", "avenue", seed, 40.0) for seed in (41, 43)),
+    Trial("drive, slowly", "drive_slowly", 43, 180.0),
     Trial("bank", "bank", 21, 40.0),
     Trial("air, 300 rpm", "survey_fast_gyro", 82, changes=AIR + "\nlidar: {rpm: 300}"),
     Trial("air, 1200 rpm", "survey_fast_gyro", 83, changes=AIR + "\nlidar: {rpm: 1200}"),

@@ -120,6 +120,13 @@ class InsOptions:
 
     gnss_sigma_m: float = option(2.0, "horizontal position, GM [m]", minimum=0, maximum=100)
     gnss_tau_s: float = option(60.0, "its time constant [s]", minimum=0.1, maximum=1e5)
+    multipath_m: float = option(
+        0.0,
+        "what walls near by do to horizontal positions, one sigma an axis, bound to the place [m]",
+        minimum=0,
+        maximum=100,
+    )
+    multipath_length_m: float = option(12.0, "way over which that changes [m]", minimum=0.1, maximum=1e4)
     position_noise_m: float = option(0.05, "white noise of a position [m]", minimum=0, maximum=100)
     height_bias_m: float = option(1.5, "constant height error, one sigma over seeds [m]", minimum=0, maximum=100)
     baro_walk_m: float = option(0.3, "random walk of the height, one sigma after a minute [m]", minimum=0, maximum=100)

@@ -36,6 +36,21 @@ def gauss_markov(rng: np.random.Generator, count: int, sigma: float, tau_s: floa
     return np.asarray(lfilter([1.0], [1.0, -keep], drive))
 
 
+def _multipath(flight: Flight, options: InsOptions, rng: np.random.Generator) -> BSpline | None:
+    """What walls do to positions, by time, east, north, up [m]: it changes with the way that is driven, and stays while one stands."""
+    if options.multipath_m <= 0.0:
+        return None
+    time_s = np.arange(-_MARGIN_S, flight.duration_s + _MARGIN_S, _STEP_S)
+    speed = np.linalg.norm(flight.velocity_m_s(np.clip(time_s, 0.0, flight.duration_s)), axis=1)
+    gone_m = np.cumsum(speed) * _STEP_S
+    step_m = 0.05 * options.multipath_length_m
+    count = int(gone_m[-1] / step_m) + 2
+    across = [gauss_markov(rng, count, options.multipath_m, options.multipath_length_m, step_m) for _ in range(2)]
+    by_time = [np.interp(gone_m, step_m * np.arange(count), each) for each in across]
+    off_m = gaussian_filter1d(np.stack([*by_time, np.zeros(len(time_s))], axis=1), _POSITION_SMOOTH_S / _STEP_S, axis=0)
+    return make_interp_spline(time_s, off_m, k=3)
+
+
 @dataclass(frozen=True, slots=True)
 class Belief:
     """Estimates of the INS: arrays of one length n.
@@ -126,6 +141,7 @@ class Ins:
             position = self._coasting(time_s, position, outage)
         self._position_error: BSpline = make_interp_spline(time_s, position, k=3)
         self._velocity_error: BSpline = self._position_error.derivative(1)
+        self._multipath = _multipath(flight, options, generator(seed, "multipath"))
 
     def _coasting(self, time_s: Array, error_m: Array, outage: Outage) -> Array:
         """Errors of position where an outage is bridged by the accelerometers, shape (n, 3) [m].
@@ -217,4 +233,6 @@ class Ins:
             swing = np.cross(self._flight.rates_rad_s(time_s, self._gain), self._antenna_m)
             velocity = velocity + np.einsum("nij,nj->ni", mat, swing)
         off = self._position_error(time_s) + self._glitch.at(time_s)
+        if self._multipath is not None:
+            off = off + np.asarray(self._multipath(time_s))
         return position + off, velocity + self._velocity_error(time_s) + self._glitch.speed_at(time_s)

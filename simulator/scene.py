@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from flightlog.errors import UsageError
 from flightlog.mount import LidarMount, Mount
+from simulator.avenue import avenue
 from simulator.buildings import (
     Windows,
     add_car,
@@ -213,6 +214,7 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] =
     "barefield": (bare_field, Mount()),
     "crops": (crops, Mount()),
     "slope": (slope, Mount()),
+    "avenue": (avenue, Mount()),
     "facades": (facades, Mount()),
     "bank": (bank, Mount()),
 }

@@ -296,3 +296,16 @@ def test_so_many_packets_get_lost():
     kept = arriving(sent_s, FaultOptions(lidar_loss=0.02), generator(1, "test"))
     # 20 000 draws of 0.02: 0.001 is one sigma of their mean
     assert kept.mean() == pytest.approx(0.98, abs=0.004)
+
+
+def test_multipath_is_bound_to_the_place_and_leaves_heights_and_velocities_alone():
+    flight = flown(120.0)
+    time_s = np.arange(0.0, 119.0, 0.1)
+    _, clean = believed(time_s, flight=flight)
+    _, seen = believed(time_s, flight=flight, multipath_m=3.0, multipath_length_m=5.0)
+    off = seen.position_m - clean.position_m
+    stands = time_s < 1.0  # the route holds for three seconds, and what is read is smoothed
+    assert np.ptp(off[stands], axis=0).max() < 0.1 * np.ptp(off, axis=0).max()
+    assert 1.0 < off[:, :2].std() < 4.0
+    assert not off[:, 2].any()
+    assert seen.velocity_m_s == pytest.approx(clean.velocity_m_s)

@@ -93,3 +93,8 @@ def test_natural_scenes_are_flown_with_the_instruments_of_the_survey(name):
     if name != "facades":
         assert min(plan.options.gyros.rotor_line_deg_s) > 0.0
         assert min(plan.options.flight.buzz_deg_s) > 0.0
+
+
+def test_the_drive_of_three_minutes_covers_600_m():
+    plan = plans.plan("drive_slowly")
+    assert plan.options.flight.speed_m_s * (plan.duration_s - 3.0) == pytest.approx(600.0, rel=0.01)

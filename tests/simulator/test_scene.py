@@ -150,7 +150,7 @@ def test_an_unknown_scene_is_refused_with_the_known_ones():
         scene("moon", 1)
 
 
-@pytest.mark.parametrize("name", ["meadow", "barefield", "crops", "slope", "facades", "bank"])
+@pytest.mark.parametrize("name", ["meadow", "barefield", "crops", "slope", "facades", "avenue", "bank"])
 def test_a_natural_scene_is_another_with_another_seed(name):
     first, again, other = (scene(name, seed).world.triangles_m for seed in (1, 1, 2))
     assert (first == again).all()
@@ -196,3 +196,16 @@ def test_the_slope_is_one():
     ground = world.triangles_m[world.surface == world.names.index("ground")].mean(axis=1)
     rise, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
     assert 11.0 < np.degrees(np.arctan(np.hypot(rise[0], rise[1]))) < 21.0
+
+
+def test_an_avenue_runs_as_the_seed_has_it_and_is_driven_at_the_height_of_a_roof():
+    for seed in (1, 2):
+        built = scene("avenue", seed)
+        points = np.array(built.route.points_m)
+        assert 1.8 <= points[:, 2].min() <= points[:, 2].max() <= 2.2
+        cars = [name for name in built.world.names if name.startswith("car ")]
+        assert len(cars) > 20
+        assert any(name.startswith("lamps") for name in built.world.names)
+    courses = [np.subtract(*np.array(scene("avenue", seed).route.points_m)[1::-1, :2]) for seed in (1, 2)]
+    east, north = (course / np.linalg.norm(course) for course in courses)
+    assert abs(east @ north) < 0.99

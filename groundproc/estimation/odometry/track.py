@@ -22,6 +22,10 @@ Ints = npt.NDArray[np.int64]
 
 KEPT: Final = 1200
 """Clusters of a slice that are kept for the batch."""
+GROUND, UPRIGHT, SHAPELESS = 0, 1, 2
+"""Kinds of voxels: level planes, other planes, and what is no plane."""
+LEANING: Final = 0.03
+"""What normals of one wall differ by, one sigma [rad]: no direction of its own."""
 NO_CLUSTERS: Final = np.empty(0, CLUSTER_DTYPE)
 
 
@@ -146,15 +150,44 @@ class Track:
 def thinned(clusters: npt.NDArray[np.void], world_m: Array, planes: PlaneMap, most: int) -> npt.NDArray[np.void]:
     """At most about `most` clusters, by voxels and not one by one, so that those kept are seen by many slices.
 
-    Ground, other planes, and what is no plane yet share evenly.
+    Ground, other planes, and what is no plane yet share evenly; of the other planes, the directions that they face do.
     """
     if len(clusters) <= most:
         return clusters
-    kind, draw = np.empty(len(clusters), np.int64), np.empty(len(clusters))
-    _sort_out(world_m, planes.arrays, kind, draw)
-    counts = np.bincount(kind, minlength=3)
-    share = even_shares(counts, most)
-    return clusters[draw < share[kind]]
+    kind, draw, normal = np.empty(len(clusters), np.int64), np.empty(len(clusters)), np.empty((len(clusters), 3))
+    _sort_out(world_m, planes.arrays, kind, draw, normal)
+    share_of_kind = even_shares(np.bincount(kind, minlength=3), most)
+    share, upright = share_of_kind[kind], kind == UPRIGHT
+    share[upright] = shares_by_direction(normal[upright], float(share[upright].sum()))
+    return clusters[draw < share]
+
+
+def shares_by_direction(normal: Array, most: float) -> Array:
+    """Part of planes to keep, so that every direction gets about as much, whatever the axes are: few ends of cars beside long walls.
+
+    By leverage, n^T (sum of n n^T)^-1 n, which sums up to one for each direction; what is kept whole leaves the rest to the others.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (n, 3)
+    most : float
+        How many to keep of them, about.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    share = np.full(len(normal), min(1.0, most / max(len(normal), 1)))
+    if not len(normal) or most >= len(normal):
+        return share
+    information = normal.T @ normal + len(normal) * LEANING**2 * np.eye(3)
+    leverage = np.einsum("ni,ij,nj->n", normal, np.linalg.inv(information), normal)
+    whole = np.zeros(len(normal), np.bool_)
+    for _ in range(4):
+        scale = (most - whole.sum()) / max(leverage[~whole].sum(), 1e-12)
+        share = np.where(whole, 1.0, np.minimum(scale * leverage, 1.0))
+        whole |= share >= 1.0
+    return share
 
 
 def even_shares(counts: Sequence[int] | npt.NDArray[np.int64], most: int) -> Array:
@@ -168,14 +201,15 @@ def even_shares(counts: Sequence[int] | npt.NDArray[np.int64], most: int) -> Arr
 
 
 @njit(cache=True, nogil=True)
-def _sort_out(world: Array, planes: MapArrays, kind: Ints, draw: Array) -> None:
+def _sort_out(world: Array, planes: MapArrays, kind: Ints, draw: Array, normal: Array) -> None:
     table, keys, voxels, voxel_m = planes
     for n in range(len(world)):
         key = voxel_key(world[n, 0], world[n, 1], world[n, 2], 1.0 / voxel_m)
         row = find(table, keys, key)
-        kind[n] = 2
+        kind[n] = SHAPELESS
         if row >= 0 and voxels[row, FLATNESS] >= 0.0:
-            kind[n] = 0 if abs(voxels[row, NORMAL + 2]) > 0.9 else 1
+            kind[n] = GROUND if abs(voxels[row, NORMAL + 2]) > 0.9 else UPRIGHT
+            normal[n] = voxels[row, NORMAL : NORMAL + 3]
         draw[n] = (spread(key * 7919) & 0xFFFFF) / 1048576.0
 
 
