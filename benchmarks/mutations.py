@@ -26,7 +26,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 LOGS: Final = tuple(
     f"tests/flightlog/test_{name}.py" for name in ("walk", "container", "logfile", "salvage", "hostile_logs")
 )
-GYROS: Final = ("tests/groundproc/flight/test_sync.py", "tests/groundproc/flight/test_sync_parts.py")
+GYROS: Final = tuple(f"tests/groundproc/flight/test_{name}.py" for name in ("sync", "sync_grid", "sync_parts"))
 SYNC: Final = ("__init__", "correlation", "fit", "result", "tracks")
 SENSORS: Final = ("__init__", "blocks", "firings", "lasers", "linescan", "shots", "velodyne")
 TESTS: Final[dict[str, tuple[str, ...]]] = {
