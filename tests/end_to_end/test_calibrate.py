@@ -87,6 +87,7 @@ def assert_sharper(before: dict[str, float], after: dict[str, float]) -> None:
     assert after["ate_m"] < before["ate_m"] + 0.002
 
 
+@pytest.mark.soak
 def test_a_later_run_with_the_file_has_the_sharper_cloud(made: Path, flight: Any) -> None:
     without, before = made_with(flight.folder, Survey(method="adjusted"))
     given, after = made_with(flight.folder, Survey(method="adjusted", lasers=str(made / "lasers.yaml")))

@@ -92,7 +92,7 @@ def test_the_compass_model_begins_the_next_run(driven: Any, made: Path, tmp_path
     assert main(["compass", str(made), "-o", str(model), "--harmonics", "0"]) == 0
     content = yaml.safe_load(model.read_text())
     assert content["coefficients_deg"][0] == pytest.approx(-ERROR_DEG, abs=1.5)
-    words = ["--method", "dynamic", "--sync", "host", "--compass", str(model)]
+    words = ["--method", "dynamic", "--sync", "host", "--compass", str(model), "--products", "trims.csv"]
     assert main(["process", str(driven.log), *words, "-o", str(tmp_path / "out")]) == 0
     error = heading_error_deg(driven, read(tmp_path / "out/trajectory.csv"))
     assert np.abs(error).mean() < 0.3 * ERROR_DEG

@@ -22,6 +22,7 @@ def flight(simulated: Callable[..., Any]) -> Any:
     return simulated("live_flight", "village", 18.0, Options())
 
 
+@pytest.mark.soak
 def test_a_flight_after_warming_up_compiles_nothing(
     tmp_path: Path, flight: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -147,7 +147,8 @@ def test_it_agrees_with_the_causal_method_on_the_log(tmp_path: Path, flight: Any
     """Behind the finished log, and by `swath process --method adjusted --causal`: the same filter in other slices."""
     out, processed = tmp_path / "live", tmp_path / "processed"
     assert main(["live", "--follow", str(flight.log), "--port", "0", "-o", str(out)]) == 0
-    assert main(["process", str(flight.log), "--method", "adjusted", "--causal", "-o", str(processed)]) == 0
+    words = ["--method", "adjusted", "--causal", "--products", "trajectory.gpx", "-o", str(processed)]
+    assert main(["process", str(flight.log), *words]) == 0
     table, causal = rows(out), read_trajectory(processed / "trajectory.csv")
     poses, covered = causal.where_covered(table["utc_ns"].astype(np.int64))
     estimated = np.stack([table[name] for name in ("east_m", "north_m", "up_m")], axis=1)[covered]

@@ -64,7 +64,8 @@ def test_a_compass_that_is_off_is_no_lost_way(tmp_path: Path, street: Any, capsy
     assert main(["live", "--follow", str(street.log), "--port", "0", "--json", "-o", str(out)]) == 0
     status = json.loads([line for line in capsys.readouterr().out.splitlines() if line.startswith("{")][-1])
     # doubtful, for half of the packets are missing, and for where the far end lies: the map has the compass's axes
-    assert main(["process", str(street.log), "--method", "adjusted", "--causal", "-o", str(processed), "--json"]) == 3
+    words = ["--method", "adjusted", "--causal", "--products", "trajectory.gpx", "-o", str(processed), "--json"]
+    assert main(["process", str(street.log), *words]) == 3
     told = json.loads(capsys.readouterr().out)
     assert [reason["about"] for reason in told["verdict_reasons"]] == ["position", "lost_packets"]
     assert told["adjusted"]["restarts"] == 0

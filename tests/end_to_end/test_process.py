@@ -23,7 +23,8 @@ from groundproc.cli import main
 from groundproc.trajectory.estimate import FILES
 
 Array = npt.NDArray[np.float64]
-PRODUCTS = {"cloud.laz", "quality.json", "cloud_height.png", "cloud_intensity.png", *FILES}
+PRODUCTS = {"cloud.laz", "quality.json", *FILES}
+PICTURES = {"cloud_height.png", "cloud_intensity.png"}
 LEDGER = ".swath"
 RANGE_NOISE_M = 0.015
 """What the simulation puts into every range (1 sigma)."""
@@ -55,7 +56,7 @@ class Processed:
 def test_without_a_wish_all_products_are_made_and_agree(still_flight: Any, tmp_path: Path) -> None:
     assert main(["process", str(still_flight.log), "--method", "ins", "-o", str(tmp_path / "out")]) in COMPLETE
     made = Processed(tmp_path / "out")
-    assert {path.name for path in made.folder.iterdir()} == PRODUCTS | {LEDGER} | {
+    assert {path.name for path in made.folder.iterdir()} == PRODUCTS | PICTURES | {LEDGER} | {
         "cloud.copc.laz", "dsm.tif", "intensity.tif", "density.tif", "hillshade.tif", "trajectory.gpkg", "report.html",
     }  # fmt: skip
     cloud, octree = made.cloud, laspy.read(made.folder / "cloud.copc.laz")
@@ -75,9 +76,9 @@ def process(folder: Path, *words: Any, method: str = "ins") -> Processed:
     """Products by the autopilot's own solution where nothing else is said: these tests are about the chain, not about the verdict."""
     told = [str(word) for word in words]
     if "--products" not in told:
-        told += ["--products", "cloud.laz, pictures, adjustment.png"]
+        told += ["--products", "cloud.laz, adjustment.png"]
     assert main(["process", *told, "--method", method, "-o", str(folder)]) in COMPLETE
-    assert {path.name for path in folder.iterdir()} - {"adjustment.png"} == PRODUCTS | {LEDGER} | set(FILES)
+    assert {path.name for path in folder.iterdir()} - {"adjustment.png"} - PICTURES == PRODUCTS | {LEDGER}
     return Processed(folder)
 
 
@@ -99,7 +100,9 @@ def rewritten(source: Path, target: Path, keep: Callable[[Any], bool]) -> Path:
 @pytest.fixture(scope="module")
 def flown(gps_flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Processed:
     """The flight with all errors, and the autopilot's own solution."""
-    return process(tmp_path_factory.mktemp("flown"), gps_flight.log)
+    made = process(tmp_path_factory.mktemp("flown"), gps_flight.log, "--products", "cloud.laz, pictures")
+    assert all((made.folder / name).is_file() for name in PICTURES)
+    return made
 
 
 @pytest.fixture(scope="module")

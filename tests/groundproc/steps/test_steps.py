@@ -23,6 +23,8 @@ ORDER = tuple(name for name in ALL if name not in (*OF_IMAGES, "uses"))
 """The steps of a flight without photographs."""
 PATIENCE_S = 300.0
 COMPLETE = (0, 3)
+SOME = ("--method", "ins", "--products", "cloud.laz,pictures,density.tif,trajectory.gpkg")
+"""A cloud, pictures of what is written, a raster of the one pass and a table: a product of each kind."""
 """Exit codes with which the products are there: 3 s of flight are too short to tie the clocks well."""
 
 
@@ -37,7 +39,7 @@ def log(dual_flight: Any) -> Path:
 def made(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its products, made in one go."""
     folder = tmp_path_factory.mktemp("made") / "out"
-    assert main(["process", str(log), "--method", "ins", "-o", str(folder)]) in COMPLETE
+    assert main(["process", str(log), *SOME, "-o", str(folder)]) in COMPLETE
     return folder
 
 
@@ -56,7 +58,7 @@ def finished(folder: Path) -> dict[str, str]:
 def units(log: Path, folder: Path, *words: object) -> set[str]:
     """Run, and name the parts of steps that were made."""
     before = finished(folder) if (folder / INSIDE).is_dir() else {}
-    assert main(["process", str(log), "--method", "ins", *map(str, words), "-o", str(folder)]) in COMPLETE
+    assert main(["process", str(log), *SOME, *map(str, words), "-o", str(folder)]) in COMPLETE
     after = finished(folder)
     return {name for name in after if before.get(name) != after[name]}
 
@@ -113,7 +115,7 @@ def test_force_does_everything_and_gives_the_same_points(log: Path, out: Path, m
 def test_a_setting_concerns_the_steps_that_look_at_it(
     log: Path, out: Path, words: list[str], done: set[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = status(capsys, log, "--method", "ins", *words, "-o", out)
+    said = status(capsys, log, *SOME, *words, "-o", out)
     assert process(log, out, *words) == done
     stale = steps_of(name for name, state in said.items() if state["state"] == "stale")
     assert stale >= done
@@ -203,7 +205,7 @@ def refused(capsys: pytest.CaptureFixture[str], log: Path, folder: Path) -> str:
     """The sentence of a run that touches nothing."""
     content = {name: (folder / name).read_bytes() for name in names(folder)}
     capsys.readouterr()
-    assert main(["process", str(log), "--method", "ins", "-o", str(folder)]) == 2
+    assert main(["process", str(log), *SOME, "-o", str(folder)]) == 2
     said = capsys.readouterr().err.strip()
     assert "\n" not in said
     assert "--force" in said
@@ -289,7 +291,7 @@ sys.exit(main(sys.argv[2:]))
 
 def interrupted(log: Path, folder: Path, step: str, number: int) -> int:
     """Run `swath process` as a process of its own and send it a signal when a step is at work; its exit code."""
-    words = ["process", str(log), "--method", "ins", "-o", str(folder)]
+    words = ["process", str(log), *SOME, "-o", str(folder)]
     with subprocess.Popen([sys.executable, "-c", HELD, step, *words], stdout=subprocess.PIPE) as run:
         assert run.stdout is not None
         assert run.stdout.readline() == b"at work\n"
@@ -335,7 +337,7 @@ def test_an_interrupt_while_products_get_their_names_waits(
         settle(ledger, step, staged)
 
     monkeypatch.setattr(Ledger, "settle", disturbed)
-    assert main(["process", str(log), "--method", "ins", "-o", str(tmp_path / "out")]) == 130
+    assert main(["process", str(log), *SOME, "-o", str(tmp_path / "out")]) == 130
     assert steps_of(finished(tmp_path / "out")) == {"clocks", "trajectory"}
     assert not list((tmp_path / "out").rglob(".*.part"))
 
@@ -353,11 +355,11 @@ def test_an_error_leaves_a_new_folder_empty_and_an_old_one_as_it_was(
 
     monkeypatch.setattr(place, "STEP", place.STEP.__class__(**{
         name: getattr(place.STEP, name) for name in place.STEP.__slots__} | {"work": full}))  # fmt: skip
-    assert main(["process", str(log), "--method", "ins", "-o", str(tmp_path / "new")]) == 1
+    assert main(["process", str(log), *SOME, "-o", str(tmp_path / "new")]) == 1
     assert "No space left" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
     before = {name: (out / name).read_bytes() for name in names(out) if INSIDE not in name}
-    assert main(["process", str(log), "--method", "ins", "--crs", "3009", "-o", str(out)]) == 1
+    assert main(["process", str(log), *SOME, "--crs", "3009", "-o", str(out)]) == 1
     assert {name: (out / name).read_bytes() for name in names(out) if INSIDE not in name} == before
     monkeypatch.undo()
     assert process(log, out) <= {"quality", "products"}
