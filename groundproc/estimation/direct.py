@@ -3,9 +3,9 @@
 from typing import Final
 
 from groundproc.estimation import ins
-from groundproc.estimation.ins import PositionFixes
 from groundproc.estimation.legs import leg_by_leg
 from groundproc.estimation.method import Given, Method, Progress
+from groundproc.estimation.ownsolution import PositionFixes
 from groundproc.flight.timeline import Leg
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from flightlog import frames
 from groundproc.estimation.inertial.readings import read
 from groundproc.estimation.inertial.solution import Solution, solve
-from groundproc.estimation.ins import PositionFixes
 from groundproc.estimation.legs import leg_by_leg
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations.states import (
@@ -25,6 +24,7 @@ from groundproc.estimation.observations.states import (
     GYRO_MATRIX,
     POSITION,
 )
+from groundproc.estimation.ownsolution import PositionFixes
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.timeline import Leg

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from flightlog.errors import LogError
-from groundproc.estimation.ins import PositionFixes
 from groundproc.estimation.method import Given
+from groundproc.estimation.ownsolution import PositionFixes
 from groundproc.flight.timeline import Leg
 from groundproc.trajectory.trajectory import Trajectory, joined
 

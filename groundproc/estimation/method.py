@@ -7,8 +7,8 @@ from pathlib import Path
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
 from groundproc import geodesy
-from groundproc.estimation import ins
-from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation import ownsolution
+from groundproc.estimation.ownsolution import PositionFixes
 from groundproc.flight.flight import Flight
 from groundproc.flight.timeline import Leg
 from groundproc.geodesy import LocalFrame
@@ -108,12 +108,12 @@ def gather(
         No positions, or heights that are not of the kind asked for.
     """
     # where none has a fix, the first boot says what is missing
-    placed = [leg for leg in timeline if ins.has_position(leg.boot)] or list(timeline[:1])
+    placed = [leg for leg in timeline if ownsolution.has_position(leg.boot)] or list(timeline[:1])
     undulation_m = None
     if survey.geoid is not None:
-        place = ins.position_fixes(placed[0].boot, "msl")
+        place = ownsolution.position_fixes(placed[0].boot, "msl")
         undulation_m = geodesy.undulation(survey.geoid, float(place.latitude_deg[0]), float(place.longitude_deg[0]))
-    fixes = [ins.position_fixes(leg.boot, survey.height, undulation_m) for leg in placed]
+    fixes = [ownsolution.position_fixes(leg.boot, survey.height, undulation_m) for leg in placed]
     first = fixes[0]
     frame = LocalFrame(float(first.latitude_deg[0]), float(first.longitude_deg[0]), float(first.height_m[0]))
     corrections = chosen_corrections(survey)

@@ -9,7 +9,7 @@ import numpy as np
 from flightlog.clock import utc_text
 from flightlog.errors import LogError
 from groundproc import geodesy
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.estimation.method import Given
 from groundproc.flight.control import ControlPoint, read_control
 from groundproc.flight.positions.fixes import OutsideFixes, lever_arm, outside_fixes
@@ -153,7 +153,7 @@ def surveyed_control(given: Given) -> tuple[ControlPoint, ...]:
     if not np.nanmin(np.where(np.isfinite(off), off, np.inf)) < FARTHEST_M:
         raise LogError(
             f"{survey.control}: no point within {FARTHEST_M:.0f} m of the flight, expected coordinates of EPSG:{code} "
-            f"({projection.crs.name}) and heights {ins.HEIGHTS[survey.height]}"
+            f"({projection.crs.name}) and heights {ownsolution.HEIGHTS[survey.height]}"
         )
     return tuple(
         replace(point, place_m=place, normal=_local_normal(projection, point, place))

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from flightlog.mount import Mount
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.estimation.odometry.grid import SLICE_NS
 from groundproc.estimation.odometry.odometry import Step
 from groundproc.estimation.odometry.slices import Slice
@@ -161,9 +161,9 @@ class Estimator:
         if self.tie is None:
             return f"tying the clocks{': ' + self.sync.trouble if self.sync.trouble else ''}"
         boot = self._telemetry.boot(60.0)
-        if boot is None or not ins.has_position(boot):
+        if boot is None or not ownsolution.has_position(boot):
             return "waiting for a position of the autopilot"
-        if ins.attitude_source(boot) is None:
+        if ownsolution.attitude_source(boot) is None:
             return "waiting for attitudes of the autopilot (ATTITUDE)"
         chosen = self._units.chosen()
         if chosen is None:

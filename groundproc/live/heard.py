@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from flightlog.errors import LogError
 from flightlog.mount import Mount
-from groundproc.estimation import ins
+from groundproc.estimation import ins, ownsolution
 from groundproc.estimation.odometry.stated import Fix
 from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
@@ -57,11 +57,11 @@ class Heard:
 
     def listen(self, boot: Boot, tie: Tie) -> None:
         """Take what is new in the autopilot's last seconds."""
-        if ins.attitude_source(boot) is not None:
-            _, boot_ns, quat, _ = ins.attitudes(boot)
+        if ownsolution.attitude_source(boot) is not None:
+            _, boot_ns, quat, _ = ownsolution.attitudes(boot)
             self._attitudes = tie.lidar_ns(boot_ns), quat
         try:
-            fixes = ins.position_fixes(boot, self._height)
+            fixes = ownsolution.position_fixes(boot, self._height)
         except LogError:
             return
         new = fixes.time_ns > self._last_fix_boot_ns
@@ -110,7 +110,7 @@ class Heard:
         if boot is None or tie is None:
             return None
         try:
-            fixes = ins.position_fixes(boot, self._height)
+            fixes = ownsolution.position_fixes(boot, self._height)
             if self.frame is None:
                 self.frame = LocalFrame(
                     float(fixes.latitude_deg[0]), float(fixes.longitude_deg[0]), float(fixes.height_m[0])

@@ -13,7 +13,7 @@ from flightlog.errors import LogError
 from flightlog.logfile import QOS, LogReader
 from flightlog.mcapwriter import McapWriter
 from flightlog.mount import Mount
-from groundproc.estimation import ins
+from groundproc.estimation import ins, ownsolution
 from groundproc.files import written_aside
 from groundproc.flight import flight as flights
 from groundproc.flight.shots import Tally, shots
@@ -148,7 +148,7 @@ def _ways(scale: Scale, mount: Mount, estimate: Estimate | None) -> tuple[list[_
     frame: LocalFrame | None = None
     for pilot in scale.pilots:
         try:
-            fixes = ins.position_fixes(pilot.boot, "msl")
+            fixes = ownsolution.position_fixes(pilot.boot, "msl")
             origin = float(fixes.latitude_deg[0]), float(fixes.longitude_deg[0]), float(fixes.height_m[0])
             frame = frame or LocalFrame(*origin)
             trajectory = ins.ins_trajectory(pilot.boot, fixes, frame, pilot.to_scale, mount)

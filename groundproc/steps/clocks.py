@@ -12,7 +12,7 @@ from flightlog.clock import utc_text
 from flightlog.constants import HOUR_NS
 from flightlog.logfile import LogReader
 from flightlog.mount import load_mount
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.summary.telemetry import FIX_3D
 from groundproc.flight.timeline import Leg
@@ -97,8 +97,8 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
     return {
         "boot": leg.boot.number,
         "lidar_run": leg.run,
-        "attitude_from": ins.attitude_source(leg.boot),
-        "position_from": ins.position_source(leg.boot),
+        "attitude_from": ownsolution.attitude_source(leg.boot),
+        "position_from": ownsolution.position_source(leg.boot),
         "utc": {
             "source": leg.utc.source,
             "sigma_s": leg.utc.sigma_ns * 1e-9,
@@ -114,9 +114,9 @@ def describe_leg(leg: Leg) -> dict[str, Any]:
 
 def describe_positions(leg: Leg) -> dict[str, Any] | None:
     """What became of the positions of a leg; None where there are none."""
-    if not ins.has_position(leg.boot):
+    if not ownsolution.has_position(leg.boot):
         return None
-    fixes = ins.position_fixes(leg.boot, "msl")
+    fixes = ownsolution.position_fixes(leg.boot, "msl")
     return {"used": len(fixes.time_ns), "left_out": fixes.left_out, "note": fixes.note}
 
 

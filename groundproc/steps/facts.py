@@ -8,7 +8,7 @@ from flightlog.clock import utc_text
 from flightlog.errors import LogError, SwathError
 from flightlog.words import clean
 from groundproc import geodesy
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.estimation.method import Given, Progress, gather
 from groundproc.estimation.odometry.motion import base_motion
 from groundproc.flight.timeline import Leg
@@ -82,9 +82,9 @@ def _method_note(given: Given, leg: Leg) -> str:
 def _height_notes(leg: Leg) -> list[str]:
     """Which heights this log holds."""
     notes = []
-    for height in ins.HEIGHTS:
+    for height in ownsolution.HEIGHTS:
         try:
-            ins.position_fixes(leg.boot, height)
+            ownsolution.position_fixes(leg.boot, height)
         except LogError as error:
             notes.append(f"this log: no height {height}: {error}")
     return notes

@@ -8,7 +8,7 @@ import numpy as np
 
 from flightlog import FORMAT_VERSION, __version__, config
 from flightlog.clock import utc_text
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.steps import OF_IMAGES, clocks, place
 from groundproc.steps.photographs import found_in
 from groundproc.steps.request import Request, absolute
@@ -53,7 +53,7 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
             "height_m": frame.height_m,
         },
         "crs": placed["crs"],
-        "height": {"reference": survey.height, "meaning": ins.HEIGHTS[survey.height]},
+        "height": {"reference": survey.height, "meaning": ownsolution.HEIGHTS[survey.height]},
         "sync": tied["sync"],
         "legs": tied["legs"],
         "autopilot": tied["autopilot"],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.ins import PositionFixes
+from groundproc.estimation.ownsolution import PositionFixes
 from groundproc.geodesy import LocalFrame
 from groundproc.numerics import robust
 

@@ -11,11 +11,11 @@ from flightlog import frames
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from flightlog.mount import Mount
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.estimation.felt import IMU_MESSAGES, autopilot_force
 from groundproc.estimation.inertial.imu import Samples, Signal, combine
-from groundproc.estimation.ins import PositionFixes
 from groundproc.estimation.observations.measured import Stated
+from groundproc.estimation.ownsolution import PositionFixes
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.positions.fixes import OutsideFixes
 from groundproc.flight.sync import GyroTrack
@@ -99,7 +99,7 @@ def read(
     LogError
         Position and attitude do not overlap.
     """
-    source, attitude_ns, quat, _ = ins.attitudes(boot)
+    source, attitude_ns, quat, _ = ownsolution.attitudes(boot)
     del source
     attitude_utc, fix_utc = utc_from_boot(attitude_ns), utc_from_boot(fixes.time_ns)
     step_ns = FAST_STEP_NS if lidar is not None else STEP_NS

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog import frames
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, Stated
 from groundproc.estimation.observations.moments import means, poses, rates, seconds, spots, within
 from groundproc.estimation.observations.observation import Flown, Observation, State
@@ -151,9 +151,9 @@ def attitude_factor(
 
 def attitude_track(leg: Leg) -> Attitudes | None:
     """The autopilot's attitudes."""
-    if ins.attitude_source(leg.boot) is None:
+    if ownsolution.attitude_source(leg.boot) is None:
         return None
-    _, time_ns, quat, _ = ins.attitudes(leg.boot)
+    _, time_ns, quat, _ = ownsolution.attitudes(leg.boot)
     return Attitudes(leg.utc_from_boot(time_ns), quat, ATTITUDE_SIGMA_RAD, ATTITUDE_TAU_S)
 
 

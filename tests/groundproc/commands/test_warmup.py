@@ -13,7 +13,7 @@ from flightlog.logfile import LogReader
 from flightlog.mavlink import FrameParser
 from flightlog.mount import Mount, parse_mount
 from groundproc import progress
-from groundproc.estimation import ins
+from groundproc.estimation import ownsolution
 from groundproc.field.madeup import ROOM_M, write_flight
 from groundproc.flight import autopilot
 from groundproc.sensors import firings
@@ -56,8 +56,8 @@ def test_its_autopilot_says_where_it_is_as_the_lidars_own_unit_feels_it(tmp_path
                 found += parser.feed(time_ns, data)
         imu = np.concatenate([records.decode_position(m.data)[1] for m in reader.messages((records.POSITION.topic,))])
     (boot,) = autopilot.boots(found)
-    assert ins.has_position(boot)
-    fixes = ins.position_fixes(boot, "msl")
+    assert ownsolution.has_position(boot)
+    fixes = ownsolution.position_fixes(boot, "msl")
     assert len(fixes.time_ns) == 10
     gyro = max(boot.gyros(), key=lambda track: len(track.time_ns))
     assert gyro.rate_hz == pytest.approx(50.0, rel=0.01)

@@ -17,7 +17,7 @@ from flightlog.errors import UsageError
 from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame
 from flightlog.mount import Mount
-from groundproc.estimation import direct, filtered, ins, methods
+from groundproc.estimation import direct, filtered, ins, methods, ownsolution
 from groundproc.estimation.inertial import readings
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.method import Given, gather
@@ -429,7 +429,7 @@ def test_the_recorded_arducopter_against_its_true_motion(
     host_s = truth[truth.dtype.names[0]]
     boot_ns, host_ns = boot.host_pairs()
     utc_ns = np.rint(host_s * 1e9 - np.median(host_ns - boot_ns)).astype(np.int64)
-    fixes = ins.position_fixes(boot, "msl")
+    fixes = ownsolution.position_fixes(boot, "msl")
     frame = LocalFrame(*(float(truth[name][0]) for name in ("lat", "lon", "alt")))
     place = frame.from_geodetic(truth["lat"], truth["lon"], truth["alt"])
     quat = frames.quat_from_mat(frames.mat_local_ins(*(np.deg2rad(truth[n]) for n in ("yaw", "pitch", "roll"))))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from flightlog.errors import LogError
 from flightlog.mavlink import Frame
 from flightlog.mount import Mount
-from groundproc.estimation import ins
+from groundproc.estimation import ins, ownsolution
 from groundproc.flight import autopilot, timebase
 from groundproc.flight.autopilot import Boot
 from groundproc.geodesy import LocalFrame
@@ -31,7 +31,7 @@ S, MS, HALF = 10**9, 10**6, 500_000
 
 def fly(boot: Boot, height: str = "msl", mount: Mount | None = None, **options: Any) -> Trajectory:
     """The trajectory on the boot clock, in the frame of its first fix."""
-    fixes = ins.position_fixes(boot, height)
+    fixes = ownsolution.position_fixes(boot, height)
     frame = LocalFrame(*(float(v[0]) for v in (fixes.latitude_deg, fixes.longitude_deg, fixes.height_m)))
     return ins.ins_trajectory(boot, fixes, frame, lambda t: t, mount or Mount(), **options)
 
@@ -194,15 +194,15 @@ def test_heights_are_of_the_kind_asked_for_or_refused(frames_of: FramesOf) -> No
     boot = hover(frames_of, places)
     assert fly(boot).frame.height_m == pytest.approx(70.0)
     assert fly(boot, "relative").frame.height_m == pytest.approx(8.7)
-    assert ins.position_fixes(boot, "ellipsoid", 29.354).height_m[0] == pytest.approx(99.354)
+    assert ownsolution.position_fixes(boot, "ellipsoid", 29.354).height_m[0] == pytest.approx(99.354)
     with pytest.raises(LogError, match="--geoid"):
-        ins.position_fixes(boot, "ellipsoid")
+        ownsolution.position_fixes(boot, "ellipsoid")
     # MAVLink 2 receivers state both heights
     both = [gps(200 * i, 58.394, 15.574, 70.0, alt_ellipsoid=99_300) for i in range(50)]
     stated = hover(frames_of, places + both)
-    assert ins.position_fixes(stated, "ellipsoid").height_m[0] == pytest.approx(99.3)
+    assert ownsolution.position_fixes(stated, "ellipsoid").height_m[0] == pytest.approx(99.3)
     # a number from the user goes before
-    assert ins.position_fixes(stated, "ellipsoid", 29.0).height_m[0] == pytest.approx(99.0)
+    assert ownsolution.position_fixes(stated, "ellipsoid", 29.0).height_m[0] == pytest.approx(99.0)
 
 
 def test_position_between_fixes_is_a_curve_with_the_stated_speed(frames_of: FramesOf) -> None:
@@ -221,7 +221,7 @@ def test_position_between_fixes_is_a_curve_with_the_stated_speed(frames_of: Fram
         east, north = 8.0 * np.cos(turn * seconds[0]), -8.0 * np.sin(turn * seconds[0])
         fixes.append(position(ms, lat, lon, alt, speed=(round(north * 100), round(east * 100), 0)))
     boot = hover(frames_of, fixes, seconds=20.0)
-    places = ins.position_fixes(boot, "msl")
+    places = ownsolution.position_fixes(boot, "msl")
     made = ins.ins_trajectory(boot, places, frame, lambda t: t, Mount())
     seconds = np.linspace(1.0, 19.0, 3000)
     off = made.at((seconds * 1e9).astype(np.int64)).position_m - circle(seconds)
@@ -264,7 +264,7 @@ def test_the_sources_grid_is_linear_to_10_ms_and_held(frames_of: FramesOf) -> No
     assert made.interpolation == HOLD
     assert set(np.diff(made.time_ns)) == {10 * MS}
     assert (made.time_ns % (10 * MS) == 0).all()
-    fixes = ins.position_fixes(boot, "msl")
+    fixes = ownsolution.position_fixes(boot, "msl")
     expected = np.interp(made.time_ns, fixes.time_ns, fixes.height_m) - made.frame.height_m
     np.testing.assert_allclose(made.position_m[:, 2], expected, atol=1e-5)
     smooth = fly(boot)
@@ -285,14 +285,14 @@ def test_the_quaternion_message_says_the_same_as_the_angles(frames_of: FramesOf)
     names = []
     for messages in (plain, turned, [m for i in range(50) for m in (position(40 * i, 58, 15, 0), other[i])]):
         (boot,) = autopilot.boots(frames_of([(HOST_NS, m) for m in [heartbeat(), *messages]]))
-        name, times, quat, rate = ins.attitudes(boot)
+        name, times, quat, rate = ownsolution.attitudes(boot)
         names.append(name)
         assert (rotations(quat).inv() * of_ned(*angles.T)).magnitude().max() < 1e-6
         assert times.tolist() == [40 * i * MS + HALF for i in range(50)]
     assert names == ["ATTITUDE", "ATTITUDE_QUATERNION", "AHRS2"]
     assert rate is None
     with pytest.raises(LogError, match="an attitude is needed"):
-        ins.attitudes(hover(frames_of, [position(0, 58, 15, 0)], attitudes=[]))
+        ownsolution.attitudes(hover(frames_of, [position(0, 58, 15, 0)], attitudes=[]))
 
 
 def test_the_lever_arm_of_the_antenna_is_taken_off_where_the_mount_has_one(frames_of: FramesOf) -> None:
@@ -349,7 +349,7 @@ def test_a_glitch_of_400_m_is_left_out_and_said(frames_of: FramesOf, bad: range)
         place = 58.4 + north * (i in bad) + i * 1e-6, 15.6, 60.0
         messages.append((HOST_NS + i * 200 * MS, position(1_000 + 200 * i, *place, speed=(56, 0, 0))))
     (boot,) = autopilot.boots(frames_of(messages))
-    fixes = ins.position_fixes(boot, "msl")
+    fixes = ownsolution.position_fixes(boot, "msl")
     assert fixes.left_out == len(bad)
     assert np.ptp(fixes.latitude_deg) < 0.5 * north
     assert f"{len(bad)} positions of GLOBAL_POSITION_INT left out" in fixes.note
@@ -362,6 +362,6 @@ def test_a_shift_of_400_m_that_lasts_is_kept_and_said(frames_of: FramesOf) -> No
         place = 58.4 + (i >= 75) * 400.0 / 111_369.0, 15.6, 60.0
         messages.append((HOST_NS + i * 200 * MS, position(1_000 + 200 * i, *place)))
     (boot,) = autopilot.boots(frames_of(messages))
-    fixes = ins.position_fixes(boot, "msl")
+    fixes = ownsolution.position_fixes(boot, "msl")
     assert (len(fixes.time_ns), fixes.left_out) == (150, 0)
     assert "shift by 400 m at 15.0 s" in fixes.note

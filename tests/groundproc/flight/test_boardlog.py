@@ -13,7 +13,7 @@ from flightlog import dataflash, frames
 from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from groundproc.cli import main
-from groundproc.estimation import ins
+from groundproc.estimation import ins, ownsolution
 from groundproc.flight import boardlog, merging
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight
@@ -82,7 +82,7 @@ def errors(truth: Any, each: Read) -> tuple[Array, Array]:
     """Errors of position [m] and attitude [rad] of method ins, shape (n, 3), by the boot clock."""
     origin, clock, poses = truth.truth["local_origin"], truth.truth["clocks"]["boot"], truth.poses
     frame = LocalFrame(origin["latitude_deg"], origin["longitude_deg"], origin["height_msl_m"])
-    fixes = ins.position_fixes(each.leg.boot, "msl")
+    fixes = ownsolution.position_fixes(each.leg.boot, "msl")
     made = ins.ins_trajectory(each.leg.boot, fixes, frame, lambda t: t, each.mount)
     at_s = (made.time_ns - clock["start_ns"]) * 1e-9 / (1 + clock["drift_ppm"] * 1e-6)
     truth_s = (poses["utc_ns"] - poses["utc_ns"][0]) * 1e-9
@@ -139,7 +139,7 @@ def test_utc_is_right_to_what_it_claims(read: dict[str, Read], plain_flight: Any
 def test_accuracy_and_pressure_come_along(read: dict[str, Read]) -> None:
     by_board, by_link = read["bin"].leg.boot, read["tlog"].leg.boot
     assert (by_board.tables["GPS_RAW_INT"]["h_acc"] == 1800.0).all()
-    assert ins.position_fixes(by_board, "msl").sigma_m[0].tolist() == pytest.approx([1.8, 1.8, 2.7])
+    assert ownsolution.position_fixes(by_board, "msl").sigma_m[0].tolist() == pytest.approx([1.8, 1.8, 2.7])
     pressures = by_board.tables["SCALED_PRESSURE"]["press_abs"]
     assert np.median(pressures) == pytest.approx(np.median(by_link.tables["SCALED_PRESSURE"]["press_abs"]), abs=0.1)
     assert {"MODE", "EV", "PARM", "MSG", "MAG"} <= set(by_board.tables)
@@ -250,7 +250,7 @@ def test_logs_of_2014_count_milliseconds_and_gps_calls_them_t(monkeypatch: pytes
     assert made.tables["SYSTEM_TIME"]["time_unix_usec"][0] * 1e-6 == pytest.approx(utc.timestamp(), abs=1e-6)
     assert {track.name: track.stamp_step_ns for track in made.gyros()} == {"HIGHRES_IMU": 1_000_000}
     with pytest.raises(LogError, match="relative"):
-        ins.position_fixes(made, "relative")
+        ownsolution.position_fixes(made, "relative")
 
 
 RAW = {
