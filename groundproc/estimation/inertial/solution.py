@@ -22,6 +22,7 @@ from groundproc.estimation.inertial.transition import Motion
 from groundproc.estimation.method import Given
 from groundproc.estimation.observations import measured_of
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Reference, Rows, System
+from groundproc.estimation.observations.outside import lasting
 from groundproc.estimation.observations.states import (
     ATTITUDE,
     BARO,
@@ -29,6 +30,7 @@ from groundproc.estimation.observations.states import (
     FORCE_BIAS,
     GYRO_BIAS,
     HEADING,
+    OUTSIDE,
     POSE,
     POSITION,
     STATES,
@@ -297,6 +299,8 @@ def _smooth(
     drive[TILT : TILT + 2] = 2.0 * model.tilt_rad**2 / model.tilt_tau_s
     drive[HEADING] = 2.0 * model.heading_rad**2 / model.heading_tau_s
     drive[BARO] = model.baro_walk**2
+    outside_sigma_m, outside_tau_s = lasting(r.outside)
+    drive[OUTSIDE : OUTSIDE + 3] = 2.0 * outside_sigma_m**2 / outside_tau_s
     keep = np.stack(
         [
             np.exp(-step_s / model.fix_tau_s),
@@ -304,6 +308,7 @@ def _smooth(
             np.exp(-step_s / model.fix_velocity_tau_s),
             np.exp(-step_s / model.tilt_tau_s),
             np.exp(-step_s / model.heading_tau_s),
+            np.exp(-step_s / outside_tau_s),
         ],
         axis=1,
     )
@@ -329,7 +334,7 @@ def _smooth(
         motion,
         kalman.Rows(system.first, system.count, system.index, system.value, system.measured, system.variance),
         start,
-        start_covariance(model, fix_sigma, r.linked),
+        start_covariance(model, fix_sigma, r.linked, outside_sigma_m),
         out,
     )
     return correction

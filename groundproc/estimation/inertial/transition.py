@@ -14,6 +14,7 @@ from groundproc.estimation.observations.states import (
     GYRO_BIAS,
     GYRO_MATRIX,
     HEADING,
+    OUTSIDE,
     POSITION,
     STATES,
     TILT,
@@ -40,9 +41,9 @@ class Motion(NamedTuple):
     rate_density, force_density : ndarray, shape (n - 1,)
         Power spectral density of the noise of both [rad^2/s], [m^2/s^3].
     gravity_m_s2 : float
-    keep : ndarray, shape (n - 1, 5)
+    keep : ndarray, shape (n - 1, 6)
         What a step leaves of the correlated errors: of the fixes' position, how much of their velocity's error goes into it [s], of the
-        velocity's, of the tilt's, of the heading's.
+        velocity's, of the tilt's, of the heading's, of a better receiver's.
     drive : ndarray, shape (STATES,)
         Density of the noise that drives the slow states [unit^2/s].
     """
@@ -129,6 +130,7 @@ def forward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
             )
             m[FIX_POSITION + i, j] = keep[0] * m[FIX_POSITION + i, j] + keep[1] * m[FIX_VELOCITY + i, j]
             m[FIX_VELOCITY + i, j] *= keep[2]
+            m[OUTSIDE + i, j] *= keep[5]
     for j in range(columns):
         m[TILT, j] *= keep[3]
         m[TILT + 1, j] *= keep[3]
@@ -149,6 +151,7 @@ def backward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
         for j in range(columns):
             m[FIX_VELOCITY + i, j] = keep[2] * m[FIX_VELOCITY + i, j] + keep[1] * m[FIX_POSITION + i, j]
             m[FIX_POSITION + i, j] *= keep[0]
+            m[OUTSIDE + i, j] *= keep[5]
             push[i, j] = m[VELOCITY + i, j] + 0.5 * dt * m[POSITION + i, j]
             swung[i, j] = (
                 couple[1, i] * m[ATTITUDE, j] + couple[2, i] * m[ATTITUDE + 1, j] + couple[3, i] * m[ATTITUDE + 2, j]

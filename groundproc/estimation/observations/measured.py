@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-WIDTH: Final = 8
+WIDTH: Final = 9
 """Most states in one row."""
 
 

@@ -14,13 +14,13 @@ import numpy.typing as npt
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows, turned_by
+from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Place, Rows, turned_by
 from groundproc.estimation.observations.moments import means, poses, rates, seconds, spots, velocities, within
 from groundproc.estimation.observations.observation import Flown, Observation, Outcome, State
 from groundproc.estimation.observations.pieces import laid_by_pieces, seen_slices
 from groundproc.estimation.observations.rows import Errors, Factor, RowBuilder, Unknowns, cross, eye
 from groundproc.estimation.observations.source import Arm, Clock
-from groundproc.estimation.observations.states import ATTITUDE, POSITION, VELOCITY
+from groundproc.estimation.observations.states import ATTITUDE, OUTSIDE, POSITION, VELOCITY
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.surveyed import surveyed
 from groundproc.flight.positions.fixes import OutsideFixes
@@ -41,6 +41,8 @@ LEAST_SIGMA_RAD: Final = np.deg2rad(0.02)
 LEAST_DELAY_SIGMA_S: Final = 0.001
 BY_BOOT_SIGMA_S: Final = 0.01
 """UTC that comes by way of the autopilot has the age of its gyros in it, which synchronisation cannot tell from an offset of clocks."""
+LASTS: Final = 0.75
+"""Part of the variance of a receiver's positions whose errors last; the rest is white."""
 MEDIAN_DISTANCE: Final = {3: 1.54, 6: 2.31}
 """Median of the distance of so many unit normals (chi distribution)."""
 OUTLIER: Final = 3.0
@@ -361,10 +363,14 @@ def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: 
 
 @dataclass(frozen=True, slots=True)
 class OutsideRows(Measured):
-    """The same in the smoother, with velocities where they are stated. Errors are taken as they come: the smoother knows no map."""
+    """The same in the smoother, with velocities where they are stated.
+
+    What lasts of the errors of a receiver is a state. Poses are taken as they come.
+    """
 
     fixes: OutsideFixes
     start_ns: int
+    lasting_m2: Array
     learnt: Mapping[str, Learnt] = field(default_factory=dict)
 
     def rows(self, rows: Rows) -> None:
@@ -374,26 +380,73 @@ class OutsideRows(Measured):
         place, inside = rows.at(time_s)
         mat = frames.mat_from_quat(place.quat)
         arm = mat @ fixes.lever_arm_m
-        rows.add_whitened(
-            "outside position",
-            place.node,
-            fixes.covariance_m2[inside],
-            fixes.position_m[inside] - place.position_m - arm,
-            [(POSITION, None), (ATTITUDE, turned_by(arm))],
-        )
+        covariance, blocks = fixes.covariance_m2[inside], [(POSITION, None), (ATTITUDE, turned_by(arm))]
+        if lasts(fixes):
+            covariance, blocks = white_part(covariance, self.lasting_m2), [*blocks, (OUTSIDE, None)]
+        left = fixes.position_m[inside] - place.position_m - arm
+        turn, spread = self._turn(place, inside), fixes.attitude_covariance_rad2
+        whole = self._pose_covariance(inside)
+        if turn is not None and whole is not None:
+            _add_poses(rows, place, whole, np.concatenate([left, turn], axis=1), arm)
+        else:
+            rows.add_whitened("outside position", place.node, covariance, left, blocks)
+            if turn is not None and spread is not None:
+                rows.add_whitened("outside attitude", place.node, spread[inside], turn, [(ATTITUDE, None)])
         if fixes.velocity_m_s is not None and fixes.velocity_covariance_m2_s2 is not None:
             swing = np.einsum("nij,nj->ni", mat, np.cross(place.rate_rad_s, fixes.lever_arm_m))
             left = fixes.velocity_m_s[inside] - place.velocity_m_s - swing
             covariance = fixes.velocity_covariance_m2_s2[inside]
             rows.add_whitened("outside velocity", place.node, covariance, left, [(VELOCITY, None)])
-        if fixes.quat_local_ins_wxyz is not None and fixes.attitude_covariance_rad2 is not None:
-            left = frames.quat_log(
-                frames.quat_multiply(fixes.quat_local_ins_wxyz[inside], frames.quat_inverse(place.quat))
-            )
-            covariance = fixes.attitude_covariance_rad2[inside]
-            rows.add_whitened("outside attitude", place.node, covariance, left, [(ATTITUDE, None)])
+
+    def _turn(self, place: Place, inside: Mask) -> Array | None:
+        """Stated attitude against the reference, shape (m, 3); None where none is stated."""
+        if self.fixes.quat_local_ins_wxyz is None:
+            return None
+        stated = self.fixes.quat_local_ins_wxyz[inside]
+        return frames.quat_log(frames.quat_multiply(stated, frames.quat_inverse(place.quat)))
+
+    def _pose_covariance(self, inside: Mask) -> Array | None:
+        """Covariances of whole poses, shape (m, 6, 6); None where places and turns are stated apart."""
+        fixes = self.fixes
+        if fixes.cross_covariance_m_rad is None or fixes.attitude_covariance_rad2 is None:
+            return None
+        crossed, turns = fixes.cross_covariance_m_rad[inside], fixes.attitude_covariance_rad2[inside]
+        whole = np.block([[fixes.covariance_m2[inside], crossed], [np.swapaxes(crossed, 1, 2), turns]])
+        return whole if np.isfinite(whole).all() else None
+
+
+def _add_poses(rows: Rows, place: Place, covariance: Array, left: Array, arm: Array) -> None:
+    """Six rows a pose, whitened together: what an image does not tell is a shift and a turn at once."""
+    count = len(left)
+    places = np.tile(np.eye(6)[:, :3], (count, 1, 1))
+    turns = np.concatenate([turned_by(arm), np.tile(np.eye(3), (count, 1, 1))], axis=1)
+    rows.add_whitened("outside pose", place.node, covariance, left, [(POSITION, places), (ATTITUDE, turns)])
 
 
 def of_leg(heard: Heard) -> list[Measured]:
     """One for each source."""
-    return [OutsideRows(fixes, heard.stated.start_ns) for fixes in heard.stated.outside]
+    lasting_m2 = np.square(lasting(heard.stated.outside)[0])
+    return [OutsideRows(fixes, heard.stated.start_ns, lasting_m2) for fixes in heard.stated.outside]
+
+
+def lasts(fixes: OutsideFixes) -> bool:
+    """Whether errors of a source are those of a receiver, which last; those of poses are what who made them says."""
+    return fixes.quat_local_ins_wxyz is None
+
+
+def lasting(sources: Sequence[OutsideFixes]) -> tuple[Array, float]:
+    """Sigma east, north, up [m] of what lasts of the errors of receivers, and for how long [s]; 0 m where there is none."""
+    receivers = [fixes for fixes in sources if lasts(fixes) and len(fixes)]
+    if not receivers:
+        return np.zeros(3), LONGER_S
+    variance = np.concatenate([np.diagonal(each.covariance_m2, axis1=1, axis2=2) for each in receivers])
+    quality = Quality(int(np.median(np.concatenate([each.quality for each in receivers]))))
+    return np.sqrt(LASTS * np.median(variance, axis=0)), TAU_S.get(quality, LONGER_S)
+
+
+def white_part(covariance: Array, lasting_m2: Array) -> Array:
+    """What covariances of positions, shape (n, 3, 3), leave beside what lasts of all alike, shape (3,); positive definite."""
+    white = (1.0 - LASTS) * covariance
+    axes = np.arange(3)
+    white[:, axes, axes] += np.maximum(LASTS * np.diagonal(covariance, axis1=1, axis2=2) - lasting_m2, 0.0)
+    return white

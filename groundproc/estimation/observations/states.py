@@ -40,7 +40,9 @@ BARO: Final = 39
 """Error of the barometer's height [m]."""
 COURSE: Final = 40
 """Angle from the direction a vehicle drives to its heading [rad], clockwise."""
-STATES: Final = 41
+OUTSIDE: Final = 41
+"""Correlated error of the positions of a better receiver [m], 3."""
+STATES: Final = 44
 POSE: Final = 9
 """The first so many are position, velocity and attitude."""
 
@@ -107,7 +109,7 @@ class Model:
     standing_m_s: float = 0.03
 
 
-def start_covariance(model: Model, fix_sigma_m: Array, linked: bool) -> Array:
+def start_covariance(model: Model, fix_sigma_m: Array, linked: bool, outside_sigma_m: Array) -> Array:
     """Covariance of the states at the start, shape (STATES, STATES); position, velocity and attitude are practically unknown."""
     sigma = np.zeros(STATES)
     sigma[POSITION : POSITION + 3] = 300.0
@@ -125,6 +127,7 @@ def start_covariance(model: Model, fix_sigma_m: Array, linked: bool) -> Array:
     sigma[COMPASS : COMPASS + 5] = np.repeat(model.compass_rad, [1, 2, 2])
     sigma[BARO] = model.baro_m
     sigma[COURSE] = model.course_rad
+    sigma[OUTSIDE : OUTSIDE + 3] = outside_sigma_m
     return np.diag(sigma**2)
 
 

@@ -345,6 +345,27 @@ def test_a_better_receiver_gives_its_accuracy(ordinary: list[Flown]) -> None:
     assert estimate.report["legs"][0]["measurements"]["outside position"]["rows"] == 3 * len(better)
 
 
+def test_sigmas_know_that_errors_of_a_receiver_last(ordinary: list[Flown]) -> None:
+    """Errors that last for 10 s are followed, not averaged: with white ones assumed two of three are beyond two sigmas."""
+    flown, sigma_m, keep = ordinary[0], 0.03, np.exp(-0.2 / 10.0)
+    with given_of(flown.simulated.log) as given:
+        better = outside(flown, given.frame, np.zeros(3), 0.2, 1e-6)
+        drawn = np.random.default_rng(5).standard_normal((len(better), 3))
+        for n in range(1, len(drawn)):
+            drawn[n] = keep * drawn[n - 1] + np.sqrt(1.0 - keep**2) * drawn[n]
+        better = replace(
+            better,
+            position_m=better.position_m + sigma_m * drawn,
+            covariance_m2=np.tile(np.eye(3) * sigma_m**2, (len(better), 1, 1)),
+        )
+        estimate = filtered.filtered_estimate(given, quiet, [better])
+        found = errors(estimate.trajectory, flown.simulated, given.frame)
+    inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
+    assert np.sqrt(np.mean(np.square(found.position[inside]))) < 1.3 * sigma_m
+    assert (np.abs(found.position[inside]) < 2.0 * found.sigma_position[inside]).mean() > 0.85
+    assert np.median(found.sigma_position[inside]) < 1.5 * sigma_m
+
+
 def test_wild_outside_positions_do_no_harm(ordinary: list[Flown]) -> None:
     flown = ordinary[0]
     with given_of(flown.simulated.log) as given:

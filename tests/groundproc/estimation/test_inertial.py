@@ -21,6 +21,7 @@ from groundproc.estimation.observations.states import (
     GYRO_BIAS,
     GYRO_MATRIX,
     HEADING,
+    OUTSIDE,
     STATES,
     TILT,
     Model,
@@ -29,7 +30,7 @@ from groundproc.estimation.observations.states import (
 
 Array = npt.NDArray[np.float64]
 NODES, STEP_S, GRAVITY = 25, 0.05, 9.81
-KEEP = (0.97, 0.05, 0.8, 0.9, 0.95)
+KEEP = (0.97, 0.05, 0.8, 0.9, 0.95, 0.85)
 
 
 def turned(quat: Array) -> Rotation:
@@ -52,6 +53,7 @@ def advanced(position: Array, velocity: Array, turn: Rotation, slow: Array, angl
     slow[drift] *= KEEP[2]
     slow[TILT - 9 : TILT - 7] *= KEEP[3]
     slow[HEADING - 9] *= KEEP[4]
+    slow[OUTSIDE - 9 : OUTSIDE - 6] *= KEEP[5]
     return position + STEP_S * (velocity + 0.5 * gained), velocity + gained, after, slow
 
 
@@ -177,7 +179,7 @@ def test_the_adjoint_keeps_its_digits_over_a_measurement_far_better_than_what_wa
 
 def test_forward_and_backward_transitions_are_each_others_transposes() -> None:
     rng = np.random.default_rng(0)
-    couple, keep = rng.standard_normal((5, 3)), rng.uniform(0.5, 1.0, 5)
+    couple, keep = rng.standard_normal((5, 3)), rng.uniform(0.5, 1.0, 6)
     forward, backward = np.eye(STATES), np.eye(STATES)
     forward_rows(forward, 0.3, couple, keep)
     backward_rows(backward, 0.3, couple, keep)
@@ -185,7 +187,7 @@ def test_forward_and_backward_transitions_are_each_others_transposes() -> None:
 
 
 def test_the_start_knows_nothing_of_position_and_heading() -> None:
-    covariance = start_covariance(Model(), np.array([3.0, 3.0, 4.5]), linked=True)
+    covariance = start_covariance(Model(), np.array([3.0, 3.0, 4.5]), linked=True, outside_sigma_m=np.full(3, 0.02))
     sigma = np.sqrt(np.diag(covariance))
     assert (sigma > 0).all()
     assert sigma[0] >= 100.0
