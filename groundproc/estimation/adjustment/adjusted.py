@@ -55,6 +55,8 @@ Array = npt.NDArray[np.float64]
 
 REFINING: Final = 0.2
 """Part of the work that is done while the log is read for the second time."""
+FIRM: Final = 1.5
+"""Times the usual sigma of its places up to which a smoother's trajectory guides the odometry."""
 LEAST_LASERS: Final = 8
 """Of a lidar whose motion the adjustment can tell from its returns."""
 
@@ -212,7 +214,9 @@ def adjust_run(
     sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
     attitudes = next((found for leg in legs if (found := attitude_track(leg)) is not None), None)
     stated = Recorded(position_track(given, legs[0]), attitudes)
-    tracker = Tracker(motion, start, mat, lever, gyro_offset(motion, own, other), stated, guide=start, in_time=False)
+    tracker = Tracker(
+        motion, start, mat, lever, gyro_offset(motion, own, other), stated, guide=firm(start), in_time=False
+    )
     pace = Pace(progress)
     windows: list[Window] = []
     begin = 0
@@ -240,6 +244,12 @@ def adjust_run(
         windows[-1].own = windows[-1].last - windows[-1].first
     pace.caught_up()
     return joined_run(windows, track, motion, sources)
+
+
+def firm(guide: Trajectory) -> Trajectory:
+    """What of a smoother's trajectory can tell that an odometry is wrong: in an outage of the GNSS it has metres a second of its own."""
+    sigma = guide.sigma_position_m.max(axis=1)
+    return replace(guide, covered=guide.covered & (sigma <= FIRM * np.nanmedian(sigma)))
 
 
 def _redo(tracker: Tracker, motion: Motion, early: list[Slice]) -> None:

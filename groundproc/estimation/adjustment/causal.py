@@ -102,6 +102,8 @@ class CausalRun:
             "causal": True,
             "seconds": len(self.track) * H,
             "restarts": self.track.restarts,
+            "rejoined": self.track.rejoined,
+            "apart": self.track.apart,
             "median_matched": float(np.median(self.track.matched)),
             "median_residual_m": float(np.nanmedian(self.track.residual_m)),
         }

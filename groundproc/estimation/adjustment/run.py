@@ -216,6 +216,8 @@ class Run:
             "seconds": len(self.track) * H,
             "blind_s": self.blind_s(),
             "restarts": self.track.restarts,
+            "rejoined": self.track.rejoined,
+            "apart": self.track.apart,
             "windows": [
                 {"start_s": w.first * H, "seconds": (w.last - w.first) * H, "rounds": w.log} for w in self.windows
             ],

@@ -15,6 +15,11 @@ odometry    the two as an iterated error-state filter; the causal mode
 start       the rough pose that it begins from
 bearing     the heading of its map against the earth's
 history     where the sensor was in the last seconds
+surfaces    what a map holds, by kinds
+seeking     where one map may lie on another, roughly
+laying      one map put closest to another from a start on
+relocation  one map laid on another metres away, or not at all
+rejoining   a path that was lost and comes back
 tracker     the forward pass over a recording or a flight that goes on: start, silent slices, fixes, loss of way
 track       what the forward pass found
 beginning   the first seconds again, backwards

@@ -58,6 +58,10 @@ class Track:
         Positions that were used, and those that came too late for it.
     voxel_m : float
         Edge of the odometry's voxels at last.
+    rejoined : list of dict
+        Pieces that were found again on the map before them, for the report.
+    apart : int
+        Pieces before the last one that it was not found on.
     """
 
     first: int
@@ -78,6 +82,8 @@ class Track:
     fixes: int = 0
     late_fixes: int = 0
     voxel_m: float = 0.5
+    rejoined: list[dict[str, float]] = field(default_factory=list)
+    apart: int = 0
 
     def __len__(self) -> int:
         return len(self.clusters)

@@ -13,6 +13,7 @@ from groundproc.estimation.odometry.history import History
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import MotionGrid
 from groundproc.estimation.odometry.odometry import Odometry, Step
+from groundproc.estimation.odometry.rejoining import Rejoining
 from groundproc.estimation.odometry.rotor import Line
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.start import RoughPoses, state_at
@@ -89,13 +90,15 @@ class Tracker:
         self._range_m, self._guide, self._checked = 0.0, guide, 0
         self._bearing = Bearing(np.zeros(3))
         self._history, self._begin_ns = History(), 0
+        self._rejoining = Rejoining(in_time)
 
     def feed(self, piece: Slice) -> Step | None:
         """Take the next slice; None before the start, and where the inertial data have ended."""
         if self.odometry is None and not self._begin(piece):
             return None
-        odometry = self.odometry
+        odometry, track = self.odometry, self.track
         assert odometry is not None
+        assert track is not None
         if piece.number < odometry.number or (piece.number + 1) * STEPS > len(self.motion):
             return None
         while odometry.number < piece.number:  # nothing was seen
@@ -107,6 +110,8 @@ class Tracker:
         step = odometry.step(piece)
         self._take_stated(odometry)
         self._note(odometry, step)
+        if self._rejoining.after(odometry, track) is not None:
+            self._history.clear()
         if self._is_astray(odometry):
             self._restart(odometry, astray=True)
         return step
@@ -157,7 +162,7 @@ class Tracker:
         track.position_m.append(state.position_m.copy())
         track.velocity_m_s.append(state.velocity_m_s.copy())
         track.gyro_bias.append(state.gyro_bias_rad_s.copy())
-        track.sigma.append(np.sqrt(np.diag(state.covariance)[:6]))
+        track.sigma.append(np.hypot(np.sqrt(np.diag(state.covariance)[:6]), self._rejoining.sigma()))
         track.matched.append(0 if step is None else step.matched)
         track.seen.append(0 if step is None else step.seen)
         track.residual_m.append(float("nan") if step is None else step.residual_m)
@@ -168,6 +173,8 @@ class Tracker:
             track.clusters.append(NO_CLUSTERS)
         else:
             track.clusters.append(thinned(step.clusters, step.world_m, odometry.map, KEPT))
+        self._rejoining.note(odometry, track.matched[-1], track.next_unheld_m[-1])
+        track.apart = self._rejoining.left + len(self._rejoining.lost)
         now_ns = self._now_ns(odometry)
         if now_ns > self._begin_ns:
             self._history.add(now_ns, track.position_m[-1], track.quat[-1])
@@ -246,6 +253,7 @@ class Tracker:
             odometry.state, odometry.map = state, PlaneMap(odometry.voxel_m)
             self.track.restarts += 1
             self.track.astray += astray
+            self._rejoining.forget()
             self._set_out(state, odometry.number)
 
     def _is_astray(self, odometry: Odometry) -> bool:

@@ -1,0 +1,94 @@
+"""One map laid on another, metres away: where it may lie is searched within its sigma, and taken only where it can lie nowhere else.
+
+Coarse: every shift and heading within reach is tried on a grid that says which cubes hold what stands and which hold ground (correlative
+matching; Olson 2009, in its idea). Fine: from the best places that are apart, points against planes with six unknowns, the reach
+narrowing (`laying`).
+
+A false place is worse than none. So enough of what stands has to lie on surfaces, most of what the other map could show has to be there,
+every direction has to be told (along a corridor one is not), and against every place a metre away far more points have to speak for the
+one than for the other (in a row of equal windows they do not).
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from groundproc.estimation.odometry.laying import INFLATION, Laid, Target
+from groundproc.estimation.odometry.seeking import starts
+from groundproc.estimation.odometry.surfaces import FILLED, GROUND, STANDING, Surfaces, thinned
+
+Array = npt.NDArray[np.float64]
+
+REACH_SIGMAS: Final = 3.5
+MARGIN: Final = np.array([1.0, 1.0, 1.0, np.deg2rad(1.0)])
+WIDEST: Final = np.array([45.0, 45.0, 24.0, np.deg2rad(15.0)])
+"""How far east, north, up [m] and about the vertical [rad] a place is sought: so many sigmas and a margin. Where that is more than the
+widest, the true place may lie outside, and nothing is sought."""
+RADIUS_M: Final = 45.0
+"""Of the map that is laid, what is so near to its middle."""
+HIGHEST_M: Final = 80.0
+"""What lies so far above or below is not looked at."""
+APART_M: Final = 1.0
+"""Places so far apart are two."""
+FEWEST_ON: Final = 60
+LEAST_SHARE: Final = 0.6
+"""Of what could be shown, so much has to be there."""
+SURER: Final = 2.5
+"""Points that lie on surfaces at one of two places only have to be of the better one by so many sigmas of chance (McNemar 1947)."""
+HELD_M: Final = 0.1
+HELD_RAD: Final = np.deg2rad(0.5)
+"""How well the worst direction has to be told."""
+FLOOR: Final = np.repeat([np.deg2rad(0.05), 0.02], 3)
+"""What is claimed of turn [rad] and shift [m] at best."""
+
+
+def laid(given: Surfaces, other: Surfaces, about_m: Array, sigma: Array) -> Laid | None:
+    """Lay what a map holds on another; None where it can lie nowhere, or not with certainty.
+
+    Parameters
+    ----------
+    given, other : Surfaces
+        On axes that differ by no more than what is sought.
+    about_m : ndarray, shape (3,)
+        Middle of the first, about which it turns.
+    sigma : ndarray, shape (4,)
+        Of east, north and up [m], and of the heading [rad].
+    """
+    reach = REACH_SIGMAS * sigma + MARGIN
+    if (reach > WIDEST).any():
+        return None
+    mine = thinned(given.near(about_m, RADIUS_M))
+    theirs = other.near(about_m, RADIUS_M + float(reach[:2].max()))
+    theirs = theirs.of(np.abs(theirs.place_m[:, 2] - about_m[2]) < HIGHEST_M)
+    if (mine.kind != GROUND).sum() < FEWEST_ON or np.isin(theirs.kind, (STANDING, FILLED)).sum() < FEWEST_ON:
+        return None
+    target = Target(theirs)
+    found = [target.closest(mine, about_m, start) for start in starts(mine, theirs, about_m, reach)]
+    return _chosen([each for each in found if each is not None], reach)
+
+
+def _chosen(found: list[Laid], reach: Array) -> Laid | None:
+    """The best place, where it passes all tests."""
+    if not found:
+        return None
+    best = max(found, key=lambda each: int(each.on.sum()))
+    others = [each for each in found if best.off(each, RADIUS_M / 3.0) > APART_M]
+    surer = min((_surer(best, each) for each in others), default=np.inf)
+    sigma, on = np.sqrt(np.diag(best.covariance)), int(best.on.sum())
+    good = (
+        on >= FEWEST_ON
+        and on >= LEAST_SHARE * best.known.sum()
+        and surer > SURER
+        and sigma[3:].max() < HELD_M
+        and sigma[:3].max() < HELD_RAD
+        and (np.abs(best.shift_m) <= reach[:3]).all()
+    )
+    return replace(best, covariance=best.covariance + np.diag(FLOOR**2), surer=surer) if good else None
+
+
+def _surer(one: Laid, other: Laid) -> float:
+    """By how many sigmas of chance more points speak for one place than for another; neighbours share their errors."""
+    for_one, for_other = int((one.on & ~other.on).sum()), int((other.on & ~one.on).sum())
+    return (for_one - for_other) / float(np.sqrt(INFLATION * max(for_one + for_other, 1)))
