@@ -36,6 +36,10 @@ FACTORS: Final = {"scale": 100.0, "spin_share": 100.0, "shear": 100.0, "lever": 
 """From the unit of quality.json to that of the table, where they differ."""
 _TITLE: Final = 150
 """Characters that fit across the picture."""
+_WIDE_IN, _PLOT_IN, _GAP_IN, _SIDE_IN, _TABLE_ROW_IN = 13.0, 2.15, 0.5, 0.75, 0.21
+"""Width of the picture, height of a plot, room below it, room at its left, height of a row of the table [inches]."""
+_RIGHT: Final = (0.15, 0.46, 0.62, 0.76, 0.9, 1.0)
+"""Where the columns of the table end."""
 DOT: Final[dict[str, Any]] = {"marker": ".", "linestyle": "", "markersize": 3}
 
 
@@ -132,13 +136,18 @@ def draw_sheet(sheet: Sheet) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FormatStrFormatter
 
-    rows = _table(sheet)
-    below = 0.1 + 0.21 * ((len(rows) + 1) // 2 + 1)  # inches of the table
-    changed = 2.6 if len(sheet.moved_m) else 0.01
-    figure = Figure(figsize=(13, 8.4 + changed + below), layout="constrained")
-    grid = figure.add_gridspec(5, 2, height_ratios=[2.6, 2.6, changed, 2.6, below])
-    axes = [[figure.add_subplot(grid[row, column]) for column in range(2)] for row in range(4)]
-    figure.suptitle(title(sheet), fontsize=10)
+    rows, words = _table(sheet), title(sheet)
+    plots = 4 if len(sheet.moved_m) else 3
+    above, below = 0.25 + 0.17 * (words.count("\n") + 1), _TABLE_ROW_IN * ((len(rows) + 1) // 2 + 1)
+    # placed by hand: to have matplotlib look for room takes it as long as two more pictures
+    high = above + plots * (_PLOT_IN + _GAP_IN) + below + 0.1
+    figure = Figure(figsize=(_WIDE_IN, high))
+    grid = figure.add_gridspec(
+        plots, 2, left=_SIDE_IN / _WIDE_IN, right=1.0 - 0.2 / _WIDE_IN, wspace=0.15,
+        top=1.0 - above / high, bottom=(below + 0.1 + _GAP_IN) / high, hspace=_GAP_IN / _PLOT_IN,
+    )  # fmt: skip
+    axes = [[figure.add_subplot(grid[row, column]) for column in range(2)] for row in range(plots)]
+    figure.suptitle(words, fontsize=10, y=1.0 - 0.1 / high)
     _lines(axes[0][0], sheet.sigma_s, sheet.sigma_position_m, ("east", "north", "up"), "position sigma [m]")
     _lines(
         axes[0][1],
@@ -161,22 +170,19 @@ def draw_sheet(sheet: Sheet) -> Figure:
     if len(knots):
         _lines(axes[2][0], knots, 100.0 * sheet.moved_m, ("east", "north", "up"), "path - odometry [cm]")
         _lines(axes[2][1], knots, np.rad2deg(sheet.turned_rad), ("x", "y", "z of the sensor"), "path - odometry [deg]")
-    else:
-        for axis in axes[2]:
-            axis.set_visible(False)
-    axis = axes[3][0]
+    axis = axes[-1][0]
     for i, name in enumerate(("east", "north", "up")):
         axis.plot(sheet.position_s, sheet.position_off_m[:, i], **DOT, color=f"C{i}", label=name)
     _finish(axis, "stated position - path [m]")
-    for axis in (axes[0][0], axes[0][1], axes[1][0], axes[1][1], axes[2][0], axes[2][1], axes[3][0]):
+    for axis in (*(each for row in axes[:-1] for each in row), axes[-1][0]):
         for start, end in _stretches(sheet.matched < BLIND_BELOW):
             left = sheet.slice_s[start - 1] if start else 0.0
             axis.axvspan(float(left), float(sheet.slice_s[end - 1]), color="0.85", zorder=0)
         axis.set_xlim(0.0, float(sheet.slice_s[-1]))
-    for axis in axes[3][0], axes[2][1], axes[1][1]:
+    for axis in axes[-1][0], axes[-2][1]:
         axis.set_xlabel("time [s]")
-    _draw_compass(axes[3][1], sheet)
-    _draw_table(figure.add_subplot(grid[4, :]), rows)
+    _draw_compass(axes[-1][1], sheet)
+    _draw_table(figure.add_axes((0.1 / _WIDE_IN, 0.1 / high, 1.0 - 0.2 / _WIDE_IN, below / high)), rows)
     return figure
 
 
@@ -237,25 +243,28 @@ def _table(sheet: Sheet) -> list[tuple[list[str], bool]]:
 
 
 def _draw_table(axis: Axes, rows: list[tuple[list[str], bool]]) -> None:
-    from matplotlib.transforms import Bbox
-
+    """Two columns of rows side by side, below heads of their own."""
     axis.set_axis_off()
     if not rows:
         return
-    # two columns side by side
     half = (len(rows) + 1) // 2
+    axis.set(xlim=(0.0, 1.0), ylim=(half + 1.0, 0.0))
     head = ["unit", "parameter", "value", "sigma", "before +-", ""]
     for column, part in enumerate((rows[:half], rows[half:])):
         if not part:
             continue
-        table = axis.table(
-            cellText=[text for text, _ in part], colLabels=head, cellLoc="right", edges="horizontal",
-            bbox=Bbox.from_bounds(0.51 * column, 1.0 - (len(part) + 1) / (half + 1), 0.49, (len(part) + 1) / (half + 1)),
-            colWidths=[0.15, 0.31, 0.16, 0.14, 0.14, 0.1],
-        )  # fmt: skip
-        table.auto_set_font_size(False)
-        table.set_fontsize(8)
-        for (row, _), cell in table.get_celld().items():
-            cell.set_edgecolor("0.8")
-            if row and part[row - 1][1]:
-                cell.get_text().set_color("0.6")
+        left, width = 0.51 * column, 0.49
+        for number, (texts, held) in enumerate([(head, False), *part]):
+            for text, right in zip(texts, _RIGHT, strict=True):
+                if text:
+                    # matplotlib's own tables measure each cell again and again
+                    axis.text(
+                        left + width * right,
+                        number + 0.5,
+                        text,
+                        fontsize=8,
+                        ha="right",
+                        va="center",
+                        color="0.6" if held else "black",
+                    )
+        axis.hlines(np.arange(len(part) + 2.0), left, left + width, color="0.8", lw=1.0)

@@ -15,6 +15,7 @@ from groundproc.cloud.points import Points
 from groundproc.files import written_aside
 from groundproc.geodesy import Projection, with_sea_level
 from groundproc.products import Chosen
+from groundproc.raster.layers import Layers
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 
@@ -42,6 +43,8 @@ class Context:
         Names of the logs.
     software : str
         What makes it.
+    layers : Layers
+        Rasters made in the same pass.
     kept : contextlib.ExitStack
         Of this product alone: what is entered here is left when the product is finished, or has failed.
     """
@@ -55,6 +58,7 @@ class Context:
     digests: Mapping[str, str] = field(default_factory=dict)
     inputs: tuple[str, ...] = ()
     software: str = f"swath {__version__}"
+    layers: Layers = field(default_factory=Layers)
     kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property

@@ -5,10 +5,9 @@ from typing import ClassVar
 
 from flightlog.config import option
 from groundproc.cloud.points import Points
-from groundproc.cloud.selection import SURFACES, Selection
 from groundproc.products.product import Context
 from groundproc.raster.grid import SMALLEST_CELL_M
-from groundproc.raster.kinds import CELL_M, gathering, kind, needed
+from groundproc.raster.kinds import CELL_M, kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,15 +42,13 @@ class RasterProduct:
     def begin(self, context: Context) -> None:
         """Begin with no points."""
         self._crs, self._path = context.crs, context.aside(self.FILE)
-        chosen = kind(self.KIND, getattr(self._options, "statistic", None))
-        self._needed = needed(chosen)
-        self._gathering = gathering(chosen, self._options.cell_m, context.folder)
-        self._selection = Selection(() if self._options.all_classes else (SURFACES,))
+        chosen, options = kind(self.KIND, getattr(self._options, "statistic", None)), self._options
+        self._layer = context.layers.layer(chosen, options.cell_m, context.folder, options.all_classes)
 
     def add(self, points: Points) -> None:
         """Take points."""
-        self._gathering.add(self._selection.of(points, self._needed))
+        self._layer.add(points)
 
     def finish(self) -> None:
         """Write the file."""
-        self._gathering.write(self._path, self._crs)
+        self._layer.write(self._path, self._crs)

@@ -4,7 +4,7 @@ Cells lie in tiles that are made where points come, so that memory follows the a
 """
 
 from collections.abc import Collection
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,13 +37,13 @@ class Cells:
 
     def __init__(self, cell_m: float, wanted: Collection[str]) -> None:
         assert set(wanted) <= set(STATISTICS), wanted
-        self.cell_m = cell_m
-        self._moments = bool({"mean", "sigma"} & set(wanted))
-        self._kept = {
-            "count": self._moments or "count" in wanted, "min": "min" in wanted, "max": "max" in wanted,
-            "mean": self._moments, "squares": "sigma" in wanted,
-        }  # fmt: skip
+        self.cell_m, self._wanted = cell_m, set(wanted)
         self._tiles: dict[tuple[int, int], Tile] = {}
+
+    def keep(self, statistic: str) -> None:
+        """Gather one statistic more; no value was taken yet."""
+        assert not self._tiles
+        self._wanted.add(statistic)
 
     def add(self, xyz_m: Array, values: npt.NDArray[Any]) -> None:
         """Take points, shape (n, 3) of which two are used, and a value of each, shape (n,); what is not finite is left out."""
@@ -51,15 +51,25 @@ class Cells:
         keep = np.isfinite(values) & np.isfinite(xyz_m[:, 0]) & np.isfinite(xyz_m[:, 1])
         if not keep.all():
             xyz_m, values = xyz_m[keep], values[keep]
-        if not len(values):
-            return
-        within, number, tiles = cells_of(xyz_m, self.cell_m)
-        order, first = sorted_by(number, len(tiles))
-        for each, place in enumerate(tiles):
+        if len(values):
+            self.add_placed(in_cells(xyz_m, self.cell_m), values)
+
+    def add_placed(self, placed: "Placed", values: Array) -> None:
+        """Take finite values, shape (n,), of points whose cells, of this size, are known."""
+        for each, place in enumerate(placed.tiles):
             tile = self._tiles.get(place)
             if tile is None:
-                tile = self._tiles[place] = Tile(self._kept)
-            tile.add(within, values, order[first[each] : first[each + 1]])
+                tile = self._tiles[place] = Tile(self._kept())
+            tile.add(placed.within, values, placed.order[placed.first[each] : placed.first[each + 1]])
+
+    def _kept(self) -> dict[str, bool]:
+        """Which arrays a tile has."""
+        wanted = self._wanted
+        moments = bool({"mean", "sigma"} & wanted)
+        return {
+            "count": moments or "count" in wanted, "min": "min" in wanted, "max": "max" in wanted,
+            "mean": moments, "squares": "sigma" in wanted,
+        }  # fmt: skip
 
     def __len__(self) -> int:
         return len(self._tiles)
@@ -129,6 +139,33 @@ class Tile:
         full = self._count > 0 if len(self._count) else np.isfinite(self._low if len(self._low) else self._high)
         rows, columns = np.nonzero(full.reshape(SIDE, SIDE))
         return int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())
+
+
+class Placed(NamedTuple):
+    """Points sorted by the tile that they lie in.
+
+    Attributes
+    ----------
+    within : ndarray of uint16, shape (n,)
+        Cell of each point within its tile.
+    order : ndarray of int64, shape (n,)
+        Numbers of the points, tile by tile.
+    first : ndarray of int64, shape (tiles + 1,)
+        Where each tile begins among them.
+    tiles : list of tuple of int
+        Column and row, counted in tiles.
+    """
+
+    within: npt.NDArray[np.uint16]
+    order: npt.NDArray[np.int64]
+    first: npt.NDArray[np.int64]
+    tiles: list[tuple[int, int]]
+
+
+def in_cells(xyz_m: Array, cell_m: float) -> Placed:
+    """Points, shape (n, 3), of which two finite coordinates are used, sorted into cells; at least one."""
+    within, number, tiles = cells_of(xyz_m, cell_m)
+    return Placed(within, *sorted_by(number, len(tiles)), tiles)
 
 
 def cells_of(

@@ -202,6 +202,12 @@ class Gathering:
     cell_m : float
     folder : Path
         For what does not fit into memory.
+    cells : Cells, optional
+        Of the same values, which others look at too and whoever made them fills; default: its own.
+
+    Attributes
+    ----------
+    cells : Cells or Medians
 
     Raises
     ------
@@ -209,15 +215,24 @@ class Gathering:
         The cell is no size.
     """
 
-    def __init__(self, kind: Kind, cell_m: float, folder: Path) -> None:
+    def __init__(self, kind: Kind, cell_m: float, folder: Path, cells: Cells | None = None) -> None:
         self._kind, self._cell_m, self._points = kind, checked_cell(cell_m), 0
-        median = kind.statistic == "median"
-        self._cells: Cells | Medians = Medians(cell_m, folder) if median else Cells(cell_m, {kind.statistic})
+        if cells is not None:
+            cells.keep(kind.statistic)
+        self.cells: Cells | Medians = (
+            cells if cells is not None
+            else Medians(cell_m, folder) if kind.statistic == "median"
+            else Cells(cell_m, {kind.statistic})
+        )  # fmt: skip
 
     def add(self, points: Points) -> None:
         """Take points."""
+        self.count(points)
+        self.cells.add(points.xyz_m, self._kind.values(points))
+
+    def count(self, points: Points) -> None:
+        """Count points whose values are taken elsewhere."""
         self._points += len(points)
-        self._cells.add(points.xyz_m, self._kind.values(points))
 
     @property
     def band(self) -> Band:
@@ -232,7 +247,7 @@ class Gathering:
         CoverageError
             No point had a value, or a few lie far from all others.
         """
-        grid = self._cells.grid()
+        grid = self.cells.grid()
         if grid is None:
             raise CoverageError(f"{path.name}: not one point has a value of {self._kind.column}")
         if grid.columns * grid.rows > _ROOM_CELLS + _ROOM_EACH * self._points:
@@ -260,11 +275,11 @@ class Gathering:
         chosen = self._kind
         if chosen.derived is not None:
             return derive(chosen.derived, self._heights, window, self._cell_m)
-        values = self._cells.window(window, chosen.statistic)
+        values = self.cells.window(window, chosen.statistic)
         return values / np.float32(self._cell_m**2) if chosen.per_area else values
 
     def _heights(self, window: Window) -> npt.NDArray[np.float32]:
-        return self._cells.window(window, self._kind.statistic)
+        return self.cells.window(window, self._kind.statistic)
 
 
 def derive(how: Derived, heights: Source, window: Window, cell_m: float) -> npt.NDArray[Any]:
