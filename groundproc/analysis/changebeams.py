@@ -6,7 +6,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from groundproc.cloud.surroundings import find
 from groundproc.numerics.voxelhash import spread, voxel_key
+from groundproc.numerics.voxelwalk import begin, next_axis
 
 Array = npt.NDArray[np.float64]
 
@@ -42,8 +44,8 @@ def passes(keys: npt.NDArray[np.int64], side: Side, edge_m: float) -> npt.NDArra
 
 
 @njit(cache=True, nogil=True)
-def _through(keys: Any, xyz: Any, away: Any, edge_m: float, table: Any, passes: Any) -> None:  # noqa: C901 (a kernel: a call for each step of a beam would cost more than the step)
-    """Count the beams that went through voxels: from the echo towards the sensor, as long as they can meet one."""
+def _entered(keys: Any, edge_m: float, table: Any) -> Any:
+    """Enter voxels into an empty table; their keys, and the least and largest of their numbers on each axis."""
     mask, per_m = len(table) - 1, 1.0 / edge_m
     packed = np.empty(len(keys), np.int64)
     low, high = np.full(3, 1 << 60), np.full(3, -(1 << 60))
@@ -57,6 +59,14 @@ def _through(keys: Any, xyz: Any, away: Any, edge_m: float, table: Any, passes: 
         while table[slot] >= 0:
             slot = (slot + 1) & mask
         table[slot] = v
+    return packed, low, high
+
+
+@njit(cache=True, nogil=True)
+def _through(keys: Any, xyz: Any, away: Any, edge_m: float, table: Any, passes: Any) -> None:
+    """Count the beams that went through voxels: from the echo towards the sensor, as long as they can meet one."""
+    per_m = 1.0 / edge_m
+    packed, low, high = _entered(keys, edge_m, table)
     at, step = np.empty(3, np.int64), np.empty(3, np.int64)
     following, each = np.empty(3), np.empty(3)
     for n in range(len(xyz)):
@@ -65,29 +75,17 @@ def _through(keys: Any, xyz: Any, away: Any, edge_m: float, table: Any, passes: 
         gone = False
         for a in range(3):
             at[a] = np.int64(np.floor(xyz[n, a] * per_m))
-            step[a] = 1 if away[n, a] > 0 else -1
+        begin(xyz[n], away[n], at, edge_m, step, following, each)
+        for a in range(3):
             gone = gone or (at[a] > high[a] and step[a] > 0) or (at[a] < low[a] and step[a] < 0)
-            if away[n, a] != 0.0:
-                edge = (at[a] + (1 if step[a] > 0 else 0)) * edge_m
-                following[a], each[a] = (edge - xyz[n, a]) / away[n, a], edge_m / abs(away[n, a])
-            else:
-                following[a] = each[a] = np.inf
         while not gone:
-            a = (
-                0
-                if following[0] <= following[1] and following[0] <= following[2]
-                else 1
-                if following[1] <= following[2]
-                else 2
-            )
+            a = next_axis(following)
             if following[a] >= 1.0:
                 break
             at[a] += step[a]
             following[a] += each[a]
             gone = (step[a] > 0 and at[a] > high[a]) or (step[a] < 0 and at[a] < low[a])
             key = ((at[0] & 0x1FFFFF) << 42) | ((at[1] & 0x1FFFFF) << 21) | (at[2] & 0x1FFFFF)
-            slot = spread(key) & mask
-            while table[slot] >= 0 and packed[table[slot]] != key:
-                slot = (slot + 1) & mask
-            if table[slot] >= 0:
-                passes[table[slot]] += 1
+            v = find(key, table, packed)
+            if v >= 0:
+                passes[v] += 1

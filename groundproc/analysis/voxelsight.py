@@ -18,6 +18,7 @@ from groundproc.cloud.metres import unstated
 from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
+from groundproc.numerics.voxelwalk import begin, next_axis
 from groundproc.radiometry import sensorpath
 from groundproc.raster import geotiff
 from groundproc.raster.geotiff import Band
@@ -147,27 +148,16 @@ def _beams(local: Any, away: Any, last: Any, hits: Any, passes: Any) -> None:
 
     Of a beam with several echoes only the last is followed; at the others it was thrown back in part.
     """
+    at, step, following, each = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for n in range(len(local)):
         i, j, k = int(local[n, 0]), int(local[n, 1]), int(local[n, 2])
         hits[i, j, k] += 1
         if not last[n]:
             continue
-        dx, dy, dz = away[n, 0], away[n, 1], away[n, 2]
-        step = np.array([1 if dx > 0 else -1, 1 if dy > 0 else -1, 1 if dz > 0 else -1])
-        at, way = np.array([i, j, k]), np.array([dx, dy, dz])
-        following, each = np.full(3, np.inf), np.full(3, np.inf)
-        for a in range(3):
-            if way[a] != 0.0:
-                edge = at[a] + (1 if step[a] > 0 else 0)
-                following[a], each[a] = (edge - local[n, a]) / way[a], 1.0 / abs(way[a])
+        at[0], at[1], at[2] = i, j, k
+        begin(local[n], away[n], at, 1.0, step, following, each)
         while True:
-            a = (
-                0
-                if following[0] <= following[1] and following[0] <= following[2]
-                else 1
-                if following[1] <= following[2]
-                else 2
-            )
+            a = next_axis(following)
             if following[a] >= 1.0:
                 break
             at[a] += step[a]
@@ -180,6 +170,7 @@ def _beams(local: Any, away: Any, last: Any, hits: Any, passes: Any) -> None:
 @njit(cache=True, nogil=True)
 def _transmittance(through: Any, ground: Any, eye: Any, target: float, out: Any) -> None:
     """Product over the voxels between the observer and each target, both in voxels."""
+    step, following, each = np.empty(3, np.int64), np.empty(3), np.empty(3)
     for i1 in range(out.shape[0]):
         for j1 in range(out.shape[1]):
             if not np.isfinite(ground[i1, j1]):
@@ -189,27 +180,16 @@ def _transmittance(through: Any, ground: Any, eye: Any, target: float, out: Any)
             way = end - start
             length = np.sqrt((way * way).sum())
             at, last = np.floor(start).astype(np.int64), np.floor(end).astype(np.int64)
-            begin = at.copy()
-            following, each, step = np.full(3, np.inf), np.full(3, np.inf), np.ones(3, np.int64)
-            for a in range(3):
-                if way[a] != 0.0:
-                    step[a] = 1 if way[a] > 0 else -1
-                    following[a] = (at[a] + (1 if step[a] > 0 else 0) - start[a]) / way[a]
-                    each[a] = 1.0 / abs(way[a])
+            first = at.copy()
+            begin(start, way, at, 1.0, step, following, each)
             share, value = 0.0, 1.0
             while share < 1.0 and value > 1e-6:
-                a = (
-                    0
-                    if following[0] <= following[1] and following[0] <= following[2]
-                    else 1
-                    if following[1] <= following[2]
-                    else 2
-                )
+                a = next_axis(following)
                 reach = min(following[a], 1.0)
                 inside = True
                 for b in range(3):
                     inside = inside and 0 <= at[b] < through.shape[b]
-                own = (at == begin).all() or (at == last).all()
+                own = (at == first).all() or (at == last).all()
                 if inside and not own:
                     value *= np.float64(through[at[0], at[1], at[2]]) ** ((reach - share) * length)
                 share = reach
