@@ -26,6 +26,8 @@ CUT: Final = 5.0
 """Sigmas beyond which a cluster is none of this plane: moving things, mixed echoes."""
 PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
+_NOTHING: Final = np.empty(0)
+_NO_VECTOR: Final = np.empty((0, 6))
 
 
 class RowArrays(NamedTuple):
@@ -141,9 +143,14 @@ class PlaneRows:
         """The columns of all unknowns times values of the rows, shape (n,), weighed and less the best plane of each voxel."""
         return self._products(_NO_VECTOR, values_m)
 
-    def _products(self, vector: Array, values_m: Array) -> Array:
+    def spread_and_projected(self, values_m: Array) -> tuple[Array, Array]:
+        """What `spread` and `projected` give, found together."""
+        projected = np.empty(len(self))
+        return self._products(_NO_VECTOR, values_m, projected), projected
+
+    def _products(self, vector: Array, values_m: Array, projected: Array = _NOTHING) -> Array:
         out = np.zeros((PARTS, self.path_size))
-        _products(self.arrays, vector, values_m, out)
+        _products(self.arrays, vector, values_m, out, projected)
         return np.asarray(out.sum(axis=0))
 
     def along(self, vector: Array) -> Array:
@@ -175,10 +182,6 @@ class PlaneRows:
     def cost(self) -> tuple[float, int]:
         """Weighted sum of squares left after the planes, and the rows that count."""
         return _cost(self.arrays), int((self.weight > 0).sum())
-
-
-_NOTHING: Final = np.empty(0)
-_NO_VECTOR: Final = np.empty((0, 6))
 
 
 def _prior(voxel_m: float) -> float:
@@ -272,14 +275,15 @@ def solved_plane(q: Array, r0: float, r1: float, r2: float) -> Any:
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _products(rows: RowArrays, vector: Array, values: Array, out: Array) -> None:
+def _products(rows: RowArrays, vector: Array, values: Array, out: Array, projected: Array) -> None:
     """Columns times values of the rows, weighed and less the best plane of each voxel: in parts, shape (parts, unknowns).
 
-    Where no values are given, shape (0,), they are the rows times a vector, shape (coefficients, 6).
+    Where no values are given, shape (0,), they are the rows times a vector, shape (coefficients, 6). What is left of the values less
+    their planes, weighed, is told in `projected`, unless that has the shape (0,).
     """
     first, knot, weights, jacobian = rows.first, rows.knot, rows.weights, rows.jacobian
     plane, weight, inverse = rows.plane, rows.weight, rows.inverse
-    voxels, given = len(first) - 1, len(values) > 0
+    voxels, given, told = len(first) - 1, len(values) > 0, len(projected) > 0
     for part in prange(PARTS):
         mine = out[part].reshape(-1, 6)
         scratch = np.empty(64)
@@ -298,6 +302,8 @@ def _products(rows: RowArrays, vector: Array, values: Array, out: Array) -> None
             d, a, b = solved_plane(inverse[v], r0, r1, r2)
             for i in range(start, end):
                 y = weight[i] * (scratch[i - start] - d - a * plane[i, 0] - b * plane[i, 1])
+                if told:
+                    projected[i] = y
                 k = knot[i]
                 w0, w1, w2, w3 = y * weights[i, 0], y * weights[i, 1], y * weights[i, 2], y * weights[i, 3]
                 for c in range(6):

@@ -165,7 +165,8 @@ class Placed(NamedTuple):
 def in_cells(xyz_m: Array, cell_m: float) -> Placed:
     """Points, shape (n, 3), of which two finite coordinates are used, sorted into cells; at least one."""
     within, number, tiles = cells_of(xyz_m, cell_m)
-    return Placed(within, *sorted_by(number, len(tiles)), tiles)
+    order, first = sorted_by(number, len(tiles))
+    return Placed(within, order, first, tiles)
 
 
 def cells_of(

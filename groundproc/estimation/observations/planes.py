@@ -64,8 +64,10 @@ class Rows(PlaneRows):
 
     def spread(self, values_m: Array) -> Array:
         """The columns of all unknowns times values of the rows, shape (n,), weighed and less the best plane of each voxel."""
-        by_path = PlaneRows.spread(self, values_m)
-        return np.concatenate([by_path, self._gradient(self.projected(values_m))]) if self.more else by_path
+        if not self.more:
+            return PlaneRows.spread(self, values_m)
+        by_path, projected = self.spread_and_projected(values_m)
+        return np.concatenate([by_path, self._gradient(projected)])
 
     def along(self, vector: Array) -> Array:
         """The rows times a vector of unknowns, shape (n,)."""

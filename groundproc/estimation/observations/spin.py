@@ -11,10 +11,11 @@ does shake so. The share of it that is wrong is one more unknown, which the surf
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from groundproc.estimation.observations.rows import Factor, RowBuilder, Unknowns
 from groundproc.estimation.odometry.clusters import Clusters
@@ -131,12 +132,43 @@ class SpinColumns:
 
     def along(self, value: Array) -> Array:
         """The rows times the unknowns, shape (6,): shape (n,)."""
-        turn = np.einsum("nk,ak->na", self.circle, value.reshape(3, 2))
-        return np.asarray(np.einsum("na,na->n", self.turning, turn))
+        out = np.empty(len(self.circle))
+        _along(self.turning, self.circle, value, out)
+        return out
 
     def gradient(self, projected: Array) -> Array:
         """Columns times weighed values less their planes, shape (n,): shape (6,)."""
-        return np.array([self.column(number) @ projected for number in range(UNKNOWNS)])
+        out = np.zeros(UNKNOWNS)
+        _gradient(self.turning, self.circle, projected, out)
+        return out
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _along(turning: Any, circle: Any, value: Any, out: Any) -> None:
+    for n in range(len(out)):
+        sine, cosine = np.float64(circle[n, 0]), np.float64(circle[n, 1])
+        x, y, z = (
+            sine * value[0] + cosine * value[1],
+            sine * value[2] + cosine * value[3],
+            sine * value[4] + cosine * value[5],
+        )
+        out[n] = turning[n, 0] * x + turning[n, 1] * y + turning[n, 2] * z
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _gradient(turning: Any, circle: Any, projected: Any, out: Any) -> None:
+    """All six in one pass: the rows are many more than the cache holds."""
+    a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for n in range(len(projected)):
+        sine, cosine = circle[n, 0] * projected[n], circle[n, 1] * projected[n]
+        x, y, z = np.float64(turning[n, 0]), np.float64(turning[n, 1]), np.float64(turning[n, 2])
+        a += x * sine
+        b += x * cosine
+        c += y * sine
+        d += y * cosine
+        e += z * sine
+        f += z * cosine
+    out[0], out[1], out[2], out[3], out[4], out[5] = a, b, c, d, e, f
 
 
 def spin_columns(jacobian: Singles, xyz_m: Singles) -> SpinColumns:

@@ -1,8 +1,10 @@
 """Rasters gathered side by side, against each gathered by itself."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from groundproc.cloud.classes import LOW_NOISE
@@ -22,14 +24,14 @@ def points(count: int, seed: int) -> Points:
     classes = np.where(rng.uniform(size=count) < 0.1, LOW_NOISE, 1).astype(np.uint8)
     sigma = rng.uniform(0.01, 0.1, count).astype(np.float32)
     sigma[::7] = np.nan
-    columns = {
+    columns: dict[str, npt.NDArray[Any]] = {
         "intensity": rng.integers(0, 255, count).astype(np.uint8), "classification": classes,
         "sigma_h": sigma, "sigma_v": sigma, "point_source_id": rng.integers(1, 3, count).astype(np.uint16),
     }  # fmt: skip
     return Points(np.arange(count, dtype=np.int64), rng.normal(0.0, [20.0, 30.0, 2.0], (count, 3)), columns)
 
 
-def values(path: Path) -> np.ndarray:
+def values(path: Path) -> npt.NDArray[Any]:
     with geotiff.opened(path) as raster:
         return np.asarray(raster.file.read(1))
 
