@@ -15,9 +15,10 @@ from flightlog.errors import SourceError
 from groundproc.cloud.octree import Cube, Key, Octree
 from groundproc.cloud.spool import Records
 from groundproc.readahead import ahead
+from groundproc.system import cores
 
-_AT_ONCE: Final = 1_000_000
-"""Points that are handed to the compressor together: its threads share whole nodes."""
+_AT_ONCE: Final = min(max(250_000 * cores(), 250_000), 1_000_000)
+"""Points that are handed to the compressor together: its threads share whole nodes, of some ten thousand points each."""
 _INFO: Final = struct.Struct("<5d2Q2d88x")
 _ENTRY: Final = struct.Struct("<4iQ2i")
 _EVLR: Final = struct.Struct("<H16sHQ32s")

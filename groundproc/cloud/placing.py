@@ -16,6 +16,7 @@ from groundproc.cloud.points import Dropped, Points
 from groundproc.cloud.selection import Selection
 from groundproc.readahead import ahead
 from groundproc.sensors.shots import Shots
+from groundproc.system import give_back_memory
 from groundproc.trajectory.trajectory import Trajectory
 
 FARTHEST_M: Final = 1e6
@@ -95,6 +96,7 @@ def handed_on(
         raise CoverageError(_all_left_out(selection, trajectory))
     if not count:
         raise CoverageError(f"not one shot gives a point: {_why_nothing(dropped, trajectory)}")
+    give_back_memory()  # finishing an octree takes much
     for sink in sinks:
         sink.finish()
     return Placed(count, dropped, dict(selection.left_out))

@@ -17,9 +17,10 @@ from flightlog.errors import SourceError
 from groundproc.cloud.packer import Packer
 from groundproc.cloud.points import Points
 from groundproc.cloud.storing import storing
+from groundproc.system import cores
 
-BUFFER_POINTS: Final = 20 * 50_000
-"""lazrs compresses 50,000 points at a time on each core: a call of many such leaves no core idle at its end."""
+BUFFER_POINTS: Final = min(max(5 * cores(), 5), 20) * 50_000
+"""lazrs compresses 50,000 points at a time on each core: a call of several such for each leaves none idle for long at its end."""
 _BUFFERS: Final = 3
 """One is filled while another is compressed and the third waits: bounded memory, and neither side idle for long."""
 

@@ -10,16 +10,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyproj
-import rasterio
-from rasterio._err import CPLE_BaseError  # what GDAL says where rasterio has no word of its own for it
-from rasterio.enums import ColorInterp
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
-from rasterio.shutil import copy
-from rasterio.transform import from_origin
 
 from flightlog import __version__
 from flightlog.errors import CaptureError, SourceError
 from groundproc.raster.grid import Grid, Window
+from groundproc.system import without
+
+with without("boto3"):  # rasterio's own way to S3
+    import rasterio
+    from rasterio._err import CPLE_BaseError  # what GDAL says where rasterio has no word of its own for it
+    from rasterio.enums import ColorInterp
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.shutil import copy
+    from rasterio.transform import from_origin
 
 BLOCK: Final = 512
 NO_DATA: Final = -9999.0

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from groundproc.imagery.painting.colour import Task, colour
 from groundproc.steps import photographs
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
@@ -21,6 +20,8 @@ def settings(request: Request) -> Mapping[str, Any]:
 
 def work(run: Run, folders: Folders) -> None:
     """Colour it."""
+    from groundproc.imagery.painting.colour import Task, colour
+
     folder = folders[WHOLE]
     task = Task(
         photographs.cloud_of(run), run.folder / photographs.BLOCK, folder / CLOUD, photographs.root_of(run),

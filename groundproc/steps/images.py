@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from groundproc.imagery import work as adjustment
-from groundproc.imagery.session import Task
 from groundproc.steps import photographs
 from groundproc.steps.photographs import BLOCK
 from groundproc.steps.request import Request
@@ -28,6 +26,9 @@ def settings(request: Request) -> Mapping[str, Any]:
 
 def work(run: Run, folders: Folders) -> None:
     """Adjust them."""
+    from groundproc.imagery import work as adjustment
+    from groundproc.imagery.session import Task
+
     survey = run.survey
     assert survey.images is not None
     rig, times = (None if path is None else Path(path) for path in (survey.rig, survey.image_times))

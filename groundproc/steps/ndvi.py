@@ -4,9 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from groundproc.imagery.painting.block import RIG
-from groundproc.imagery.painting.indices import INDICES, Task, indices
-from groundproc.imagery.rig import read_rig
 from groundproc.steps import photographs
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
@@ -28,6 +25,10 @@ def files(request: Request) -> Mapping[str, Path]:
 
 def work(run: Run, folders: Folders) -> None:
     """Make it, or say what the photographs lack."""
+    from groundproc.imagery.painting.block import RIG
+    from groundproc.imagery.painting.indices import INDICES, Task, indices
+    from groundproc.imagery.rig import read_rig
+
     folder, block, panels = folders[WHOLE], run.folder / photographs.BLOCK, run.survey.panels
     bands = {band for camera in read_rig(block / RIG).cameras for band in camera.bands}
     lacking = [band for band in INDICES[INDEX] if band not in bands]

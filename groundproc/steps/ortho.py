@@ -3,9 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from groundproc.imagery.painting.block import COLOURS, RIG
-from groundproc.imagery.painting.ortho import Task, ortho
-from groundproc.imagery.rig import read_rig
 from groundproc.steps import photographs
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
@@ -21,6 +18,10 @@ def settings(request: Request) -> Mapping[str, Any]:
 
 def work(run: Run, folders: Folders) -> None:
     """Make it."""
+    from groundproc.imagery.painting.block import COLOURS, RIG
+    from groundproc.imagery.painting.ortho import Task, ortho
+    from groundproc.imagery.rig import read_rig
+
     folder, block = folders[WHOLE], run.folder / photographs.BLOCK
     kinds = [camera.bands or COLOURS for camera in read_rig(block / RIG).cameras]
     task = Task(

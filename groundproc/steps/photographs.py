@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from flightlog.errors import UsageError
-from groundproc.imagery.photos import common_folder, files_of
 from groundproc.products import chosen
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
@@ -40,7 +39,11 @@ def photographs(request: Request) -> list[Path]:
     CaptureError
         There are none.
     """
-    return [] if request.survey.images is None else files_of([Path(request.survey.images)])
+    if request.survey.images is None:
+        return []
+    from groundproc.imagery.photos import files_of
+
+    return files_of([Path(request.survey.images)])
 
 
 def files(request: Request, *named: str) -> dict[str, Path]:
@@ -48,6 +51,8 @@ def files(request: Request, *named: str) -> dict[str, Path]:
     pictures = photographs(request)
     if not pictures:
         return {}
+    from groundproc.imagery.photos import common_folder
+
     root = common_folder(pictures)
     found = {f"image {path.absolute().relative_to(root).as_posix()}": path for path in pictures}
     given = {name: getattr(request.survey, name) for name in named}
@@ -75,6 +80,8 @@ def cloud_of(run: Run) -> Path:
 
 def root_of(run: Run) -> Path:
     """The folder that names of pictures are below."""
+    from groundproc.imagery.photos import common_folder
+
     return common_folder(photographs(run.request))
 
 

@@ -35,6 +35,7 @@ from groundproc.steps.run import Run
 from groundproc.steps.software import version
 from groundproc.steps.step import BETWEEN, WHOLE, Key, Step, steps
 from groundproc.survey import FILES, Survey
+from groundproc.system import give_back_memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +150,7 @@ def execute(step: Step, parts: Sequence[str], run: Run, ledger: Ledger, force: b
         raise type(error)(_in_place(str(error), folders, ledger.folder)) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
+        give_back_memory()
 
 
 def _in_place(sentence: str, folders: Mapping[str, Path], target: Path) -> str:

@@ -8,13 +8,16 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import pyogrio
 import pyproj
 import shapely
-from pyogrio.errors import DataLayerError, DataSourceError
 from pyproj.exceptions import CRSError
 
 from flightlog.errors import CaptureError, GeodesyError, SourceError, UsageError
+from groundproc.system import without
+
+with without("pandas", "geopandas", "pyarrow"):  # data frames: a second, and 60 MB
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
 
 DRIVERS: Final = {".gpkg": "GPKG", ".geojson": "GeoJSON", ".json": "GeoJSON"}
 _SAME: Final = 90

@@ -1,0 +1,28 @@
+"""What systems do differently, and what is installed beside us."""
+
+import subprocess
+import sys
+
+import pytest
+
+from groundproc.system import without
+
+
+def test_what_is_hidden_cannot_be_imported_and_can_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "wave", raising=False)
+    with without("wave"), pytest.raises(ImportError):
+        import wave
+    import wave
+
+    with without("wave"):  # what is loaded already stays
+        assert sys.modules["wave"] is wave
+
+
+def test_the_steps_of_a_flight_load_no_data_frames_no_cloud_services_and_no_images() -> None:
+    """A second of each run, and 60 MB beside the estimation."""
+    program = (
+        "import sys; import groundproc.steps.process; from groundproc.steps.step import steps; from groundproc.products import chosen;"
+        "steps(); chosen(None); print(*({'pandas', 'boto3', 'cv2', 'matplotlib', 'groundproc.imagery'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
