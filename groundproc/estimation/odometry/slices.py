@@ -124,6 +124,8 @@ class Clusterer:
         self.voxel_m = voxel_m
         self._table = np.full(TABLE_SIZE, -1, np.int32)
         self._keys = np.empty(TABLE_SIZE, np.int64)
+        # fresh memory of four megabytes for each slice would take as long as filling it
+        self._sums = np.empty((TABLE_SIZE // 2, 15))
 
     def __call__(
         self, piece: Slice, start_ns: int, quat: Array, position_m: Array, apart: bool = False
@@ -147,7 +149,7 @@ class Clusterer:
             Their means in the local frame with these poses.
         """
         count = len(piece.time_ns)
-        sums = np.zeros((min(count, TABLE_SIZE // 2), 15))
+        sums = self._sums[:count]
         laser = piece.laser if apart and piece.laser is not None else np.zeros(count, np.uint8)
         lasers = np.zeros(len(sums), np.int32)
         poses = PathArrays(start_ns, STEP_NS, quat, position_m)
@@ -240,6 +242,7 @@ def _gather(returns: _Returns, poses: PathArrays, voxels: _Table, sums: Array, l
             lasers[row] = laser[n]
             table[slot], keys[slot], slots[found] = row, key, slot
             found += 1
+            sums[row, :12] = 0.0
             sums[row, 12] = (np.floor(x * per_m) + 0.5) * voxel_m
             sums[row, 13] = (np.floor(y * per_m) + 0.5) * voxel_m
             sums[row, 14] = (np.floor(z * per_m) + 0.5) * voxel_m
