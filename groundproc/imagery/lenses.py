@@ -219,19 +219,26 @@ def projected(kind: int, lens: Array, ray: Array, out: Array) -> bool:
         out[0] = lens[FOCAL] * a + lens[SKEW] * b + lens[PU]
         out[1] = lens[FOCAL] * lens[ASPECT] * b + lens[SKEW + 1] * a + lens[PV]
         return True
+    if kind != PHOTOGRAMMETRIC:
+        across = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1])
+        angle = np.arctan2(across, ray[2])
+        if angle > lens[FARTHEST]:
+            return False
+        distance, slope = radial(kind, lens, angle)
+        share = distance / across if across >= 1e-9 * abs(ray[2]) else slope / ray[2]
+        a, b = share * ray[0], share * ray[1]
+        out[0] = lens[FOCAL] * a + lens[SKEW] * b + lens[PU]
+        out[1] = lens[FOCAL] * lens[ASPECT] * b + lens[SKEW + 1] * a + lens[PV]
+        return True
     place, jac, unused = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 5))
     if not distorted(kind, lens, ray, place, jac, unused):
         return False
     focal, aspect = lens[FOCAL], lens[ASPECT]
-    if kind == PHOTOGRAMMETRIC:
-        millimetre = lens[PIXEL_MM]
-        measured = np.zeros(2)
-        if not _undone(lens, -1.0, focal * place[0] * millimetre, -focal * aspect * place[1] * millimetre, measured):
-            return False
-        out[0], out[1] = lens[PU] + measured[0] / millimetre, lens[PV] - measured[1] / millimetre
-        return True
-    out[0] = focal * place[0] + lens[SKEW] * place[1] + lens[PU]
-    out[1] = focal * aspect * place[1] + lens[SKEW + 1] * place[0] + lens[PV]
+    millimetre = lens[PIXEL_MM]
+    measured = np.zeros(2)
+    if not _undone(lens, -1.0, focal * place[0] * millimetre, -focal * aspect * place[1] * millimetre, measured):
+        return False
+    out[0], out[1] = lens[PU] + measured[0] / millimetre, lens[PV] - measured[1] / millimetre
     return True
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.numerics.planes import flattest
-from groundproc.numerics.voxelhash import spread, voxel_key
+from groundproc.numerics.voxelhash import around, numbered, table_for
 
 Array = npt.NDArray[np.float64]
 
@@ -89,8 +89,8 @@ def normals(xyz_m: Array, edges_m: tuple[float, ...] = EDGES_M) -> Normals:
 
 
 def _level(xyz_m: Array, edge_m: float) -> _Level:
-    table = np.full(1 << int(np.ceil(np.log2(max(2 * len(xyz_m), 1 << 10)))), -1, np.int32)
-    voxel, keys, voxels = _number(xyz_m, 1.0 / edge_m, table)
+    table = table_for(2 * len(xyz_m))
+    voxel, keys, voxels = numbered(xyz_m, 1.0 / edge_m, table)
     moments = np.zeros((voxels, 10))
     _gather(xyz_m, voxel, moments)
     near = np.full((voxels, 27), -1, np.int32)
@@ -101,23 +101,6 @@ def _level(xyz_m: Array, edge_m: float) -> _Level:
     )  # fmt: skip
     _fit(moments, level)
     return level
-
-
-@njit(cache=True, nogil=True)
-def _number(xyz: Any, per_m: float, table: Any) -> Any:
-    """Number of the voxel of each point, the key of each voxel, and how many there are."""
-    n = len(xyz)
-    voxel, keys, mask, found = np.empty(n, np.int32), np.empty(n, np.int64), len(table) - 1, 0
-    for i in range(n):
-        key = voxel_key(xyz[i, 0], xyz[i, 1], xyz[i, 2], per_m)
-        slot = spread(key) & mask
-        while table[slot] >= 0 and keys[table[slot]] != key:
-            slot = (slot + 1) & mask
-        if table[slot] < 0:
-            table[slot], keys[found] = found, key
-            found += 1
-        voxel[i] = table[slot]
-    return voxel, keys, found
 
 
 @njit(cache=True, nogil=True)
@@ -142,19 +125,8 @@ def _gather(xyz: Any, voxel: Any, moments: Any) -> None:
 @njit(cache=True, nogil=True)
 def _neighbours(keys: Any, table: Any, near: Any) -> None:
     """Numbers of the 27 voxels at and around each; -1: holds no point."""
-    mask, low = len(table) - 1, np.int64(0x1FFFFF)
     for v in range(len(keys)):
-        x, y, z = (keys[v] >> 42) & low, (keys[v] >> 21) & low, keys[v] & low
-        k = 0
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                for h in range(-1, 2):
-                    key = (((x + i) & low) << 42) | (((y + j) & low) << 21) | ((z + h) & low)
-                    slot = spread(key) & mask
-                    while table[slot] >= 0 and keys[table[slot]] != key:
-                        slot = (slot + 1) & mask
-                    near[v, k] = table[slot]
-                    k += 1
+        around(keys, table, v, near[v])
 
 
 @njit(cache=True, nogil=True)

@@ -28,19 +28,22 @@ def spread(key: Any) -> Any:
 
 def assign(world_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.int32], int]:
     """Number of the voxel of each point, and how many voxels there are."""
-    table = np.full(1 << int(np.ceil(np.log2(max(4 * len(world_m), 1 << 12)))), -1, np.int32)
-    voxel, voxels = _assign(world_m, voxel_m, table)
+    voxel, _, voxels = numbered(world_m, 1.0 / voxel_m, table_for(4 * len(world_m)))
     return voxel, int(voxels)
 
 
+def table_for(slots: int) -> npt.NDArray[np.int32]:
+    """An empty table with room for so many voxels and more."""
+    return np.full(1 << int(np.ceil(np.log2(max(slots, 1 << 10)))), -1, np.int32)
+
+
 @njit(cache=True, nogil=True)
-def _assign(world: Array, voxel_m: float, table: npt.NDArray[np.int32]) -> Any:
-    """Number of the voxel of each point, and how many there are."""
-    voxel = np.empty(len(world), np.int32)
-    keys = np.empty(len(world), np.int64)
-    mask, per_m, found = len(table) - 1, 1.0 / voxel_m, 0
-    for n in range(len(world)):
-        key = voxel_key(world[n, 0], world[n, 1], world[n, 2], per_m)
+def numbered(xyz: Any, per_m: float, table: npt.NDArray[np.int32]) -> Any:
+    """Number of the voxel of each point, the key of each voxel, and how many there are."""
+    voxel, keys = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.int64)
+    mask, found = len(table) - 1, 0
+    for n in range(len(xyz)):
+        key = voxel_key(xyz[n, 0], xyz[n, 1], xyz[n, 2], per_m)
         slot = spread(key) & mask
         while table[slot] >= 0 and keys[table[slot]] != key:
             slot = (slot + 1) & mask
@@ -48,7 +51,24 @@ def _assign(world: Array, voxel_m: float, table: npt.NDArray[np.int32]) -> Any:
             table[slot], keys[found] = found, key
             found += 1
         voxel[n] = table[slot]
-    return voxel, found
+    return voxel, keys, found
+
+
+@njit(cache=True, nogil=True)
+def around(keys: Any, table: Any, voxel: int, near: Any) -> None:
+    """Numbers of the 27 voxels at and around one, by x, y, z; -1: holds no point."""
+    mask, low = len(table) - 1, np.int64(0x1FFFFF)
+    x, y, z = (keys[voxel] >> 42) & low, (keys[voxel] >> 21) & low, keys[voxel] & low
+    k = 0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for h in range(-1, 2):
+                key = (((x + i) & low) << 42) | (((y + j) & low) << 21) | ((z + h) & low)
+                slot = spread(key) & mask
+                while table[slot] >= 0 and keys[table[slot]] != key:
+                    slot = (slot + 1) & mask
+                near[k] = table[slot]
+                k += 1
 
 
 @njit(cache=True, nogil=True)

@@ -9,7 +9,9 @@ from groundproc.imagery.painting.views import NOBODY, Views
 
 Gains = npt.NDArray[np.float32]
 
-_MOST_POINTS: Final = 400_000
+_MOST_POINTS: Final = 40_000
+_POINTS_AN_IMAGE: Final = 1000
+"""More of them than `_MOST_POINTS` where there are many images: of 1000 pairs that scatter by a tenth a factor is right to 0.3 %."""
 _DARK: Final = 0.03
 _BRIGHT: Final = 0.97
 """Shares of the full scale between which numbers follow the light."""
@@ -39,7 +41,7 @@ def gains(views: Views, images: int, full: float, measured: bool = False) -> Gai
     shared = np.flatnonzero(views.total >= 2)
     if measured or not len(shared):
         return out
-    shared = shared[:: max(1, len(shared) // _MOST_POINTS)]
+    shared = shared[:: max(1, len(shared) // max(_MOST_POINTS, _POINTS_AN_IMAGE * images))]
     image, value = views.image[shared], np.asarray(views.value[shared], np.float64)
     for plane in range(planes):
         first, second, ratio = _pairs(image, value[:, :, plane], full)
@@ -70,11 +72,9 @@ def _solve(
     for _ in range(_ROUNDS):
         residual = (found[first] - found[second] - ratio) / _SCATTER
         weight = 1.0 / (1.0 + residual**2) / _SCATTER**2
-        normal = np.diag(np.full(images, 1.0 / _PRIOR**2))
-        right = np.zeros(images)
-        for a, b, sign in ((first, second, 1.0), (second, first, -1.0)):
-            np.add.at(normal, (a, a), weight)
-            np.add.at(normal, (a, b), -weight)
-            np.add.at(right, a, sign * weight * ratio)
+        pairs = np.bincount(first * images + second, weight, images * images).reshape(images, images)
+        pairs += pairs.T
+        right = np.bincount(first, weight * ratio, images) - np.bincount(second, weight * ratio, images)
+        normal = np.diag(pairs.sum(axis=1) + 1.0 / _PRIOR**2) - pairs
         found = np.asarray(np.linalg.solve(normal, right), np.float64)
     return np.asarray(found - found.mean())

@@ -244,8 +244,7 @@ def _seen(
         seen = project(eye, tile.known.xyz_m)
         if not len(seen.number):
             continue
-        clear = depths.sees(seen, tile.known, eye.place_m)
-        some = Seen(seen.number[clear], seen.pixel[clear], seen.range_m[clear])
+        some = depths.sees(seen, tile.known, eye.place_m)
         if len(some.number):
             yield tile, some, _from_above(eye, tile, some) * weights(some, camera.width_px, camera.height_px)
 

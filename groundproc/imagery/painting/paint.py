@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from flightlog.errors import CaptureError
 from groundproc.imagery import pictures
@@ -119,8 +120,7 @@ def visible(block: Block, image: Image, scene: Scene) -> Iterator[tuple[Square, 
     depths, looked = found
     camera = block.rig.cameras[image.camera].camera
     for square, seen in looked:
-        clear = depths.sees(seen, scene.surface(square), image.eye.place_m - square.centre_m)
-        some = Seen(seen.number[clear], seen.pixel[clear], seen.range_m[clear])
+        some = depths.sees(seen, scene.surface(square), image.eye.place_m - square.centre_m)
         if len(some.number):
             yield square, some, weights(some, camera.width_px, camera.height_px)
 
@@ -128,8 +128,9 @@ def visible(block: Block, image: Image, scene: Scene) -> Iterator[tuple[Square, 
 def depths_of(block: Block, image: Image, scene: Scene) -> tuple[Depths, list[tuple[Square, Seen]]] | None:
     """The depth image of a picture, and the points that lie in it, hidden or not; None: there are none."""
     camera = block.rig.cameras[image.camera].camera
-    near = list(towards(scene.squares, image.eye.place_m, image.axis, blocks.half_angle_rad(camera)))
-    looked = [(square, seen) for square in near if len((seen := _in_picture(image, scene, square)).number)]
+    angle = blocks.half_angle_rad(camera)
+    near = towards(scene.squares, image.eye.place_m, image.axis, angle)
+    looked = [(square, seen) for square in near if len((seen := _in_picture(image, scene, square, angle)).number)]
     if not looked:
         return None
     ranges = np.concatenate([seen.range_m[:: max(1, len(seen.range_m) // 1000)] for _, seen in looked])
@@ -141,13 +142,23 @@ def depths_of(block: Block, image: Image, scene: Scene) -> tuple[Depths, list[tu
     return depths, looked
 
 
-def _in_picture(image: Image, scene: Scene, square: Square) -> Seen:
+def _in_picture(image: Image, scene: Scene, square: Square, half_angle_rad: float) -> Seen:
     eye = image.eye._replace(place_m=image.eye.place_m - square.centre_m)
-    return project(eye, scene.xyz_m[square.points])
+    spans = square.spans(image.eye.place_m, image.axis, half_angle_rad)
+    return project(eye, scene.xyz_m[square.points], spans)
 
 
 def weights(seen: Seen, width_px: int, height_px: int) -> npt.NDArray[np.float32]:
     """Of views: near is better, and the middle of the picture."""
-    off = (seen.pixel - 0.5 * np.array([width_px, height_px], np.float32)) / (0.5 * np.hypot(width_px, height_px))
-    taper = 1.0 - (1.0 - _EDGE) * (off**2).sum(axis=1)
-    return np.asarray(taper / np.maximum(seen.range_m, 0.1) ** 2, np.float32)
+    out = np.empty(len(seen.number), np.float32)
+    _weigh(seen, width_px, height_px, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _weigh(seen: Any, width_px: int, height_px: int, out: Any) -> None:
+    square = 0.25 * (width_px**2 + height_px**2)
+    for i in range(len(out)):
+        across, down = seen.pixel[i, 0] - 0.5 * width_px, seen.pixel[i, 1] - 0.5 * height_px
+        range_m = max(seen.range_m[i], 0.1)
+        out[i] = (1.0 - (1.0 - _EDGE) * (across * across + down * down) / square) / (range_m * range_m)

@@ -1,6 +1,6 @@
 """Planes in small cells of a cloud: how far points stand apart, which way the surface looks, how rough it is.
 
-Cells, not neighbours of each point: a plane of a few points each, for all points at the cost of sorting them.
+Cells, not neighbours of each point: a plane of a few points each, for all points at the cost of finding their cells.
 """
 
 from typing import Any, Final, NamedTuple
@@ -9,10 +9,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-Array = npt.NDArray[np.float64]
+from groundproc.numerics.planes import flattest
+from groundproc.numerics.voxelhash import around, numbered, table_for
 
-_COLUMN_M: Final = 0.5
-_HALF: Final = 1 << 31
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+
+COLUMN_M: Final = 0.5
+"""Side of the columns of ground whose tops tell which side of a wall is outside."""
 _SIDE: Final = 3.5
 """Of a cell, in usual spacings of the points."""
 _LEAST: Final = 6
@@ -35,67 +39,77 @@ class Known(NamedTuple):
 
     Attributes
     ----------
-    spacing_m, rough_m, above_m : ndarray, shape (n,)
+    spacing_m, rough_m, above_m : ndarray of float32, shape (n,)
         Distance of neighbours, deviation of points from their plane, and that of this one, along the normal.
-    normal : ndarray, shape (n, 3)
+    normal : ndarray of float32, shape (n, 3)
         Of length 1 where outwards is known, 1/2 where not, 0 where there is no plane.
     """
 
-    spacing_m: Array
-    normal: Array
-    rough_m: Array
-    above_m: Array
+    spacing_m: npt.NDArray[np.float32]
+    normal: npt.NDArray[np.float32]
+    rough_m: npt.NDArray[np.float32]
+    above_m: npt.NDArray[np.float32]
 
 
 class _Cells(NamedTuple):
-    """Cells of a grid that hold points, in the order of their keys, and the planes of their points."""
+    """Cells of a grid that hold points, the table that finds them by their keys, and the planes of their points."""
 
     size_m: float
-    offset: float
-    first: npt.NDArray[np.int64]
-    wide: npt.NDArray[np.int64]
-    key: npt.NDArray[np.int64]
+    keys: npt.NDArray[np.int64]
+    table: Ints
     points: npt.NDArray[np.int64]
     normal: Array
     rough_m: Array
     middle_m: Array
 
 
-def surfaces(xyz_m: Array) -> tuple[float, Known]:
-    """The usual spacing of points, shape (n, 3), and what is known about each.
+def columns(xyz_m: Array) -> tuple[Ints, tuple[int, int]]:
+    """The column of ground that each point, shape (n, 3), stands in, row by row, and how many there are both ways."""
+    low = np.floor(xyz_m[:, :2].min(axis=0) / COLUMN_M)
+    rows, across = (np.floor(xyz_m[:, :2].max(axis=0) / COLUMN_M) - low).astype(int) + 1
+    out = np.empty(len(xyz_m), np.int32)
+    _columns(xyz_m, low, int(across), out)
+    return out, (int(rows), int(across))
+
+
+def surfaces(xyz_m: Array, known: Known) -> float:
+    """Fill in what is known about points, shape (n, 3), and give their usual spacing.
 
     Of two grids of cells, one half a cell off: a plane that lies along the border of the cells of one lies within those of the other. A
     cell at an edge holds points of two surfaces. Those take the best plane among their cell's and its neighbours' that they lie on.
     """
     tops = _tops(xyz_m)
-    usual_m = float(np.sqrt(np.count_nonzero(np.isfinite(tops[0])) * _COLUMN_M**2 / len(xyz_m)))
+    usual_m = float(np.sqrt(np.count_nonzero(np.isfinite(tops[0])) * COLUMN_M**2 / len(xyz_m)))
     grids = [_cells(xyz_m, _SIDE * usual_m, offset, tops) for offset in (0.0, 0.5)]
     smooth = [cells.rough_m[(cells.normal != 0.0).any(axis=1)] for cells, _ in grids]
     usual_rough_m = float(np.median(np.concatenate(smooth))) if sum(map(len, smooth)) else 0.0
     score = np.full(len(xyz_m), np.inf)
-    known = Known(np.zeros(len(xyz_m)), np.zeros((len(xyz_m), 3)), np.zeros(len(xyz_m)), np.zeros(len(xyz_m)))
+    for values in known:
+        values[:] = 0.0
     for cells, of_point in grids:
         _assign(xyz_m, of_point, cells, usual_rough_m, score, known)
     (one, of_one), (other, of_other) = grids
-    fuller = np.maximum(one.points[of_one], other.points[of_other])
-    known.spacing_m[:] = _SIDE * usual_m / np.sqrt(fuller)
-    return usual_m, known
+    _spacings(one.points, of_one, other.points, of_other, _SIDE * usual_m, known.spacing_m)
+    return usual_m
 
 
-def _cells(
-    xyz_m: Array, cell_m: float, offset: float, tops: tuple[Array, npt.NDArray[np.int64]]
-) -> tuple[_Cells, npt.NDArray[np.int64]]:
+def _cells(xyz_m: Array, cell_m: float, offset: float, tops: tuple[Array, Array]) -> tuple[_Cells, Ints]:
     """The cells of one grid, and the cell of each point."""
-    cell = np.floor(xyz_m / cell_m + offset).astype(np.int64)
-    first = cell.min(axis=0)
-    cell -= first
-    wide = cell.max(axis=0) + 1
-    packed = (cell[:, 0] * wide[1] + cell[:, 1]) * wide[2] + cell[:, 2]
-    key, of_point, count = np.unique(packed, return_inverse=True, return_counts=True)
-    of_point = of_point.reshape(-1)
-    normal, rough_m, middle_m = _planes(xyz_m, of_point, count)
+    table = table_for(2 * len(xyz_m))
+    of_point, keys, count = numbered(xyz_m + offset * cell_m, 1.0 / cell_m, table)
+    points, middle_m, spread = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 6))
+    _moments(xyz_m, of_point, points, middle_m, spread)
+    normal, rough_m = np.zeros((count, 3)), np.zeros(count)
+    _planes(points, spread, normal, rough_m)
     normal = _outwards(normal, middle_m, tops)
-    return _Cells(cell_m, offset, first, wide, key, count, normal, rough_m, middle_m), of_point
+    return _Cells(cell_m, keys[:count], table, points, normal, rough_m, middle_m), of_point
+
+
+@njit(cache=True, nogil=True)
+def _columns(xyz: Any, low: Any, across: int, out: Any) -> None:
+    for i in range(len(xyz)):
+        row, column = np.floor(xyz[i, 0] / COLUMN_M) - low[0], np.floor(xyz[i, 1] / COLUMN_M) - low[1]
+        out[i] = np.int32(row) * across + np.int32(column)
 
 
 @njit(cache=True, nogil=True)
@@ -104,20 +118,23 @@ def _assign(xyz_m: Any, of_point: Any, cells: Any, usual_rough_m: float, score: 
 
     A cell that is as smooth as most is no edge, and its points look no farther.
     """
-    good = np.empty(len(cells.key), np.bool_)
+    good = np.empty(len(cells.keys), np.bool_)
     for c in range(len(good)):
         flat = cells.normal[c, 0] != 0.0 or cells.normal[c, 1] != 0.0 or cells.normal[c, 2] != 0.0
         good[c] = flat and cells.rough_m[c] <= _SMOOTH * usual_rough_m
-    around = np.full((len(cells.key), 27), -1, np.int64)
-    for c in range(len(good)):
-        if good[c]:
-            around[c, 0] = c
-        else:
-            _neighbours(cells, c, around[c])
+    near: Any = np.empty(27, np.int32)
+    of_near: Any = -1
     for i in range(len(xyz_m)):
-        for c in around[of_point[i]]:
+        own = of_point[i]
+        if good[own]:
+            _offer(xyz_m[i], cells, own, (True, usual_rough_m), score[i : i + 1], known, i)
+            continue
+        if of_near != own:  # points of one cell often follow each other
+            around(cells.keys, cells.table, own, near)
+            of_near = own
+        for c in near:
             if c >= 0:
-                _offer(xyz_m[i], cells, c, (c == of_point[i], usual_rough_m), score[i : i + 1], known, i)
+                _offer(xyz_m[i], cells, c, (c == own, usual_rough_m), score[i : i + 1], known, i)
 
 
 @njit(cache=True, nogil=True)
@@ -147,60 +164,70 @@ def _offer(place: Any, cells: Any, c: int, terms: Any, score: Any, known: Any, p
 
 
 @njit(cache=True, nogil=True)
-def _neighbours(cells: Any, c: int, out: Any) -> None:
-    """The cell itself and those of the 26 around it that hold points."""
-    wide, count = cells.wide, 0
-    z = cells.key[c] % wide[2]
-    y = cells.key[c] // wide[2] % wide[1]
-    x = cells.key[c] // (wide[2] * wide[1])
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                i, j, k = x + dx, y + dy, z + dz
-                if i < 0 or j < 0 or k < 0 or i >= wide[0] or j >= wide[1] or k >= wide[2]:
-                    continue
-                key = (i * wide[1] + j) * wide[2] + k
-                place = np.searchsorted(cells.key, key)
-                if place < len(cells.key) and cells.key[place] == key:
-                    out[count] = place
-                    count += 1
+def _spacings(ones: Any, of_one: Any, others: Any, of_other: Any, side_m: float, out: Any) -> None:
+    """The distance of neighbours by the fuller one of a point's two cells."""
+    for i in range(len(out)):
+        out[i] = side_m / np.sqrt(max(ones[of_one[i]], others[of_other[i]]))
 
 
-def _tops(xyz_m: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    """The highest point of each column of ground, and the first column."""
-    column = np.floor(xyz_m[:, :2] / _COLUMN_M).astype(np.int64)
-    first = column.min(axis=0)
-    column -= first
-    top = np.full(column.max(axis=0) + 1, -np.inf)
-    np.maximum.at(top, (column[:, 0], column[:, 1]), xyz_m[:, 2])
-    return top, first
+def _tops(xyz_m: Array) -> tuple[Array, Array]:
+    """The highest point of each column of ground, and the number of the first column both ways."""
+    of_point, shape = columns(xyz_m)
+    top = np.full(shape[0] * shape[1], -np.inf)
+    _highest(xyz_m, of_point, top)
+    return top.reshape(shape), np.floor(xyz_m[:, :2].min(axis=0) / COLUMN_M)
 
 
-def _planes(xyz_m: Array, of_point: npt.NDArray[np.int64], count: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Normals, shape (cells, 3), 0 where there is no plane, roughnesses and middles."""
-    cells = len(count)
-
-    def sums(values: npt.NDArray[Any]) -> Array:
-        return np.bincount(of_point, values, cells) / count
-
-    middle = np.stack([sums(xyz_m[:, axis]) for axis in range(3)], axis=1)
-    off = xyz_m - middle[of_point]
-    spread = np.empty((cells, 3, 3))
-    for i in range(3):
-        for j in range(i, 3):
-            spread[:, i, j] = spread[:, j, i] = sums(off[:, i] * off[:, j])
-    normal, rough = np.zeros((cells, 3)), np.zeros(cells)
-    enough = np.flatnonzero(count >= _LEAST)
-    size, axes = np.linalg.eigh(spread[enough])
-    extent = np.sqrt(np.maximum(size, 0.0))
-    flat = extent[:, 0] < _FLAT * extent[:, 1]
-    # a plane takes three of the points' freedoms
-    free = count[enough][flat] / (count[enough][flat] - 3.0)
-    normal[enough[flat]], rough[enough[flat]] = axes[flat, :, 0], extent[flat, 0] * np.sqrt(free)
-    return normal, rough, middle
+@njit(cache=True, nogil=True)
+def _highest(xyz: Any, of_point: Any, top: Any) -> None:
+    for i in range(len(xyz)):
+        top[of_point[i]] = max(top[of_point[i]], xyz[i, 2])
 
 
-def _outwards(normal: Array, middle_m: Array, tops: tuple[Array, npt.NDArray[np.int64]]) -> Array:
+@njit(cache=True, nogil=True)
+def _moments(xyz: Any, of_point: Any, points: Any, middle: Any, spread: Any) -> None:
+    """Number, middle and mean products of the deviations from it (xx, xy, xz, yy, yz, zz) of the points of each cell."""
+    first = np.zeros((len(points), 3))
+    for i in range(len(xyz)):
+        c = of_point[i]
+        if points[c] == 0:
+            first[c] = xyz[i]
+        points[c] += 1
+        # from the first of them: sums of squares of coordinates themselves would lose the digits that count
+        x, y, z = xyz[i, 0] - first[c, 0], xyz[i, 1] - first[c, 1], xyz[i, 2] - first[c, 2]
+        m, s = middle[c], spread[c]
+        m[0], m[1], m[2] = m[0] + x, m[1] + y, m[2] + z
+        s[0], s[1], s[2] = s[0] + x * x, s[1] + x * y, s[2] + x * z
+        s[3], s[4], s[5] = s[3] + y * y, s[4] + y * z, s[5] + z * z
+    for c in range(len(points)):
+        m, s = middle[c], spread[c]
+        place = 0
+        for axis in range(3):
+            m[axis] /= points[c]
+        for i in range(3):
+            for j in range(i, 3):
+                s[place] = s[place] / points[c] - m[i] * m[j]
+                place += 1
+        for axis in range(3):
+            m[axis] += first[c, axis]
+
+
+@njit(cache=True, nogil=True)
+def _planes(points: Any, spread: Any, normal: Any, rough: Any) -> None:
+    """Normals and roughnesses where there is a plane."""
+    found = np.empty(3)
+    for c in range(len(points)):
+        if points[c] < _LEAST:
+            continue
+        s = spread[c]
+        least, middle = flattest(s[0], s[1], s[2], s[3], s[4], s[5], found)
+        least = max(least, 0.0)
+        if least < _FLAT * _FLAT * middle:
+            normal[c] = found
+            rough[c] = np.sqrt(least * points[c] / (points[c] - 3.0))  # a plane takes three of the points' freedoms
+
+
+def _outwards(normal: Array, middle_m: Array, tops: tuple[Array, Array]) -> Array:
     """Normals turned outwards: up, and of walls to where there is less."""
     top, first = tops
     wall = (np.abs(normal[:, 2]) < _UPRIGHT) & (normal != 0.0).any(axis=1)
@@ -208,7 +235,7 @@ def _outwards(normal: Array, middle_m: Array, tops: tuple[Array, npt.NDArray[np.
     across = out[wall, :2] / np.linalg.norm(out[wall, :2], axis=1, keepdims=True)
 
     def height(sign: float) -> Array:
-        column = np.floor((middle_m[wall, :2] + sign * _STEP_M * across) / _COLUMN_M).astype(np.int64) - first
+        column = (np.floor((middle_m[wall, :2] + sign * _STEP_M * across) / COLUMN_M) - first).astype(np.int64)
         inside = ((column >= 0) & (column < top.shape)).all(axis=1)
         column[~inside] = 0
         return np.where(inside, top[column[:, 0], column[:, 1]], np.nan)

@@ -3,26 +3,35 @@
 It lies on the disk and is mapped, so that clouds of any size can be looked at from any side, square by square.
 """
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from groundproc.cloud import reader
 from groundproc.cloud.spool import Spool
-from groundproc.imagery.painting.planes import surfaces
+from groundproc.imagery.painting.planes import Known, columns, surfaces
 from groundproc.imagery.painting.visibility import Surface
 from groundproc.imagery.site import Site
+from groundproc.numerics.voxelhash import sorted_by
+from groundproc.system import cores
 
 Array = npt.NDArray[np.float64]
+T = TypeVar("T")
+U = TypeVar("U")
 
 SIDE_M: Final = 32.0
 """Of a square of ground."""
 _RECORD: Final = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("number", "i8")])
 _HALF: Final = 1 << 31
+_TILE: Final = 8
+"""Columns along each side of a tile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +48,39 @@ class Square:
         Of the ball about it that holds them all.
     spacing_m : float
         Usual distance of neighbours.
+    tiles : Tiles
     """
 
     points: slice
     centre_m: Array
     radius_m: float
     spacing_m: float
+    tiles: "Tiles"
+
+    def spans(self, place_m: Array, axis: Array, half_angle_rad: float) -> npt.NDArray[np.int64]:
+        """Points of the tiles that a cone from a place about an axis meets, first and that after the last, shape (k, 2)."""
+        met = np.flatnonzero(
+            _meets(self.centre_m + self.tiles.centre_m, self.tiles.radius_m, place_m, axis, half_angle_rad)
+        )
+        return np.stack([self.tiles.first[met], self.tiles.first[met + 1]], axis=1)
+
+
+class Tiles(NamedTuple):
+    """Small parts of a square; their points follow each other.
+
+    Attributes
+    ----------
+    first : ndarray of int64, shape (k + 1,)
+        First point of each, and that after the last one's; from the square's first.
+    centre_m : ndarray, shape (k, 3)
+        From the square's centre.
+    radius_m : ndarray, shape (k,)
+        Of the ball about it that holds them all.
+    """
+
+    first: npt.NDArray[np.int64]
+    centre_m: Array
+    radius_m: Array
 
 
 class Scene:
@@ -73,25 +109,24 @@ class Scene:
         self._rough_m = mapped(folder / "rough", np.float32, (self.size,))
         self._above_m = mapped(folder / "above", np.float32, (self.size,))
         self.squares: list[Square] = []
-        first = 0
-        for place in sorted(spool.counts):
-            records = spool.take(place)
-            points = slice(first, first + len(records))
-            first += len(records)
-            corner_m = np.array([place[0] * SIDE_M, place[1] * SIDE_M, base_m])
-            local = localised(site, corner_m, np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float64))
-            centre_m = 0.5 * (local.min(axis=0) + local.max(axis=0))
-            local -= centre_m
-            self.xyz_m[points], self.number[points] = local, records["number"]
-            usual_m = self._know(points, local)
-            radius_m = float(np.sqrt((local**2).sum(axis=1).max()))
-            self.squares.append(Square(points, centre_m, radius_m, usual_m))
+        self.squares.extend(side_by_side(self._squared, _pieces(spool, site, base_m)))
 
-    def _know(self, points: slice, local: Array) -> float:
-        """Fill in what follows from the neighbours of points; gives their usual distance."""
-        usual_m, known = surfaces(local)
-        self.spacing_m[points], self._normal[points], self._rough_m[points], self._above_m[points] = known
-        return usual_m
+    def _squared(self, piece: "_Piece") -> Square:
+        """Fill in what is known about the points of a square."""
+        site, corner_m, records, first = piece
+        local = localised(site, corner_m, np.stack([records[axis] for axis in "xyz"], axis=1))
+        centre_m = 0.5 * (local.min(axis=0) + local.max(axis=0))
+        local -= centre_m
+        # neighbours follow each other: what they look up in pictures lies side by side
+        key, count = _order(local)
+        order, begins = sorted_by(key, count)
+        local = local[order]
+        points = slice(first, first + len(records))
+        self.xyz_m[points], self.number[points] = local, records["number"][order]
+        known = Known(self.spacing_m[points], self._normal[points], self._rough_m[points], self._above_m[points])
+        usual_m = surfaces(local, known)
+        radius_m = float(np.sqrt(np.einsum("ij,ij->i", local, local).max()))
+        return Square(points, centre_m, radius_m, usual_m, _tiles(local, begins[:: _TILE**2]))
 
     def surface(self, square: Square) -> Surface:
         """What is known of the points of a square, in coordinates from its centre."""
@@ -103,6 +138,55 @@ class Scene:
             self._rough_m[points],
             self._above_m[points],
         )
+
+
+def _order(local: Array) -> tuple[npt.NDArray[np.int32], int]:
+    """Number of the column of each point, tile by tile, and how many there are."""
+    column, (rows, across) = columns(local)
+    row, column = np.divmod(column, np.int32(across))
+    wide = -(-across // _TILE)
+    tile = (row // _TILE) * wide + column // _TILE
+    return tile * _TILE**2 + (row % _TILE) * _TILE + column % _TILE, -(-rows // _TILE) * wide * _TILE**2
+
+
+def _tiles(local: Array, first: npt.NDArray[np.int64]) -> Tiles:
+    """The tiles that hold points."""
+    first = np.append(first[:-1][np.diff(first) > 0], len(local))
+    low, high = (np.asarray(edge.reduceat(local, first[:-1], axis=0)) for edge in (np.minimum, np.maximum))
+    return Tiles(first, 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1))
+
+
+class _Piece(NamedTuple):
+    """Points of a square as they wait on the disk, and the place of its first one among all."""
+
+    site: Site
+    corner_m: Array
+    records: npt.NDArray[Any]
+    first: int
+
+
+def _pieces(spool: Spool, site: Site, base_m: float) -> Iterator[_Piece]:
+    first = 0
+    for place in sorted(spool.counts):
+        records = spool.take(place)
+        yield _Piece(site, np.array([place[0] * SIDE_M, place[1] * SIDE_M, base_m]), records, first)
+        first += len(records)
+
+
+def side_by_side(work: Callable[[T], U], items: Iterable[T]) -> Iterator[U]:
+    """Results of work in the order of the items, on all cores; no more than a few items are held at once."""
+    with ThreadPoolExecutor(cores()) as pool:
+        running: deque[Future[U]] = deque()
+        try:
+            for item in items:
+                running.append(pool.submit(work, item))
+                if len(running) > cores():
+                    yield running.popleft().result()
+            while running:
+                yield running.popleft().result()
+        finally:
+            for each in running:
+                each.cancel()
 
 
 def mapped(path: Path, dtype: npt.DTypeLike, shape: tuple[int, ...]) -> npt.NDArray[Any]:
@@ -131,14 +215,16 @@ def _spooled(cloud: reader.Cloud, folder: Path, progress: Callable[[int], object
     return spool, base_m or 0.0
 
 
-def localised(site: Site, corner_m: Array, xyz_m: Array) -> Array:
+def localised(site: Site, corner_m: Array, xyz_m: npt.NDArray[Any]) -> Array:
     """Local coordinates of map coordinates from a corner: by a polynomial of second degree, exact over a square to micrometres."""
-    low, high = xyz_m.min(axis=0), xyz_m.max(axis=0)
+    low, high = (edge(axis=0).astype(np.float64) for edge in (xyz_m.min, xyz_m.max))
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)
     steps = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     local = site.local(corner_m + middle + steps * half)
     terms, *_ = np.linalg.lstsq(_terms(steps), local, rcond=None)
-    return np.asarray(_terms((xyz_m - middle) / half) @ terms)
+    out = np.empty((len(xyz_m), 3))
+    _evaluate(xyz_m, middle, half, np.ascontiguousarray(terms), out)
+    return out
 
 
 def _terms(u: Array) -> Array:
@@ -146,14 +232,36 @@ def _terms(u: Array) -> Array:
     return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
 
 
-def towards(squares: list[Square], place_m: Array, axis: Array, half_angle_rad: float) -> Iterator[Square]:
+@njit(cache=True, nogil=True)
+def _evaluate(xyz: Any, middle: Any, half: Any, terms: Any, out: Any) -> None:
+    """The polynomial with terms, shape (10, 3), as `_terms` has them, of each point."""
+    for i in range(len(xyz)):
+        x, y, z = (
+            (xyz[i, 0] - middle[0]) / half[0],
+            (xyz[i, 1] - middle[1]) / half[1],
+            (xyz[i, 2] - middle[2]) / half[2],
+        )
+        for axis in range(3):
+            t = terms[:, axis]
+            out[i, axis] = (
+                t[0] + x * (t[1] + t[4] * x + t[7] * y + t[8] * z) + y * (t[2] + t[5] * y + t[9] * z) + z * (t[3] + t[6] * z)
+            )  # fmt: skip
+
+
+def towards(squares: list[Square], place_m: Array, axis: Array, half_angle_rad: float) -> list[Square]:
     """Squares that a cone from a place about an axis meets."""
-    for square in squares:
-        way = square.centre_m - place_m
-        distance = float(np.linalg.norm(way))
-        if distance <= square.radius_m:
-            yield square
-            continue
-        angle = np.arccos(np.clip(way @ axis / distance, -1.0, 1.0))
-        if angle - np.arcsin(square.radius_m / distance) <= half_angle_rad:
-            yield square
+    centre_m = np.array([square.centre_m for square in squares])
+    radius_m = np.array([square.radius_m for square in squares])
+    met = np.flatnonzero(_meets(centre_m, radius_m, place_m, axis, half_angle_rad))
+    return [squares[number] for number in met]
+
+
+def _meets(
+    centre_m: Array, radius_m: Array, place_m: Array, axis: Array, half_angle_rad: float
+) -> npt.NDArray[np.bool_]:
+    """Whether balls, shape (n, 3) and (n,), are met by a cone from a place about an axis."""
+    way = centre_m - place_m
+    distance = np.linalg.norm(way, axis=1)
+    far = np.maximum(distance, 1e-9)
+    angle = np.arccos(np.clip(way @ axis / far, -1.0, 1.0))
+    return np.asarray((distance <= radius_m) | (angle - np.arcsin(np.minimum(radius_m / far, 1.0)) <= half_angle_rad))

@@ -9,7 +9,9 @@ import numpy.typing as npt
 from groundproc.imagery.painting.block import Layer
 from groundproc.imagery.painting.views import NOBODY, Views
 
-_MOST_POINTS: Final = 200_000
+_MOST_POINTS: Final = 40_000
+_POINTS_AN_IMAGE: Final = 1000
+"""More of them than `_MOST_POINTS` where there are many images."""
 _FEWEST: Final = 100
 """Points by which an image is judged."""
 
@@ -42,7 +44,7 @@ def score(layer: Layer, views: Views, factor: npt.NDArray[np.float32]) -> Score:
     several = np.flatnonzero(views.total >= 2)
     if not len(several):
         return Score({}, {})
-    several = several[:: max(1, len(several) // _MOST_POINTS)]
+    several = several[:: max(1, len(several) // max(_MOST_POINTS, _POINTS_AN_IMAGE * len(layer.images)))]
     image, value = views.image[several], np.asarray(views.value[several], np.float64)
     there = image != NOBODY
     balanced = value * np.where(there[..., None], factor[np.where(there, image, 0)], 0.0)

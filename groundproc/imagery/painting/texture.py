@@ -107,9 +107,7 @@ def textured(
             if way @ image.axis + each.radius_m < 0.0:
                 continue
             eye = image.eye._replace(place_m=-way)
-            inside = project(eye, each.known.xyz_m)
-            clear = found[0].sees(inside, each.known, eye.place_m)
-            seen = Seen(inside.number[clear], inside.pixel[clear], inside.range_m[clear])
+            seen = found[0].sees(project(eye, each.known.xyz_m), each.known, eye.place_m)
             if len(seen.number):
                 weight = weights(seen, camera.width_px, camera.height_px) * _facing(each.known, seen, eye.place_m)
                 insert(each.views, shown, seen, weight.astype(np.float32), number)

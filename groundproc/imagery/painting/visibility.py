@@ -86,11 +86,13 @@ class Seen(NamedTuple):
     range_m: npt.NDArray[np.float32]
 
 
-def project(eye: Eye, xyz_m: npt.NDArray[Any]) -> Seen:
-    """Local points, shape (n, 3), in the picture, whether hidden or not."""
-    number = np.empty(len(xyz_m), np.int64)
-    pixel, range_m = np.empty((len(xyz_m), 2), np.float32), np.empty(len(xyz_m), np.float32)
-    count = _project(eye, xyz_m, number, pixel, range_m)
+def project(eye: Eye, xyz_m: npt.NDArray[Any], spans: npt.NDArray[np.int64] | None = None) -> Seen:
+    """Local points, shape (n, 3), in the picture, whether hidden or not; of spans (first and that after the last), shape (k, 2), or all."""
+    spans = np.array([[0, len(xyz_m)]]) if spans is None else spans
+    most = int((spans[:, 1] - spans[:, 0]).sum())
+    number = np.empty(most, np.int64)
+    pixel, range_m = np.empty((most, 2), np.float32), np.empty(most, np.float32)
+    count = _project(eye, xyz_m, spans, number, pixel, range_m)
     return Seen(number[:count], pixel[:count], range_m[:count])
 
 
@@ -134,18 +136,25 @@ class Depths:
         self._focal = focal_px * self._scale
         self._gap_px = _CLOSED * apart_px * self._scale
         width, height = (int(np.ceil(side * self._scale)) + 1 for side in eye.size_px)
-        self.nearest = np.full((height, width), np.inf, np.float32)
-        """Distance to the nearest point for each of its pixels [m]; infinite where there is none."""
+        self._near = np.zeros((height, width), np.float32)
+        """One over the distance to the nearest point for each of its pixels [1/m]; 0 where there is none."""
         self._facing = np.zeros((height, width), np.float32)
         """Cosine of the angle between its ray and the normal of the plane there; 0 where nobody knows."""
         self._turning = _turning(eye) / self._scale
 
+    @property
+    def nearest(self) -> npt.NDArray[np.float32]:
+        """Distance to the nearest point for each of its pixels [m]; infinite where there is none."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / self._near)
+
     def at(self, pixel: Array) -> npt.NDArray[np.float32]:
         """The distance to the nearest point at pixels of the picture, shape (n, 2)."""
         row, column = ((pixel[:, axis] + 0.5) * self._scale for axis in (1, 0))
-        height, width = self.nearest.shape
+        height, width = self._near.shape
         places = np.clip(row, 0, height - 1).astype(np.intp), np.clip(column, 0, width - 1).astype(np.intp)
-        return np.asarray(self.nearest[places])
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / self._near[places])
 
     def add(self, seen: Seen, surface: Surface, place_m: Array) -> None:
         """Take points.
@@ -158,7 +167,7 @@ class Depths:
         place_m : ndarray, shape (3,)
             Projection centre in the frame of their coordinates.
         """
-        _splat(seen, surface, place_m, (self._scale, self._focal), self._turning, (self.nearest, self._facing))
+        _splat(seen, surface, place_m, (self._scale, self._focal), self._turning, (self._near, self._facing))
 
     def close(self) -> None:
         """Close the gaps between all points, once they are in."""
@@ -167,18 +176,18 @@ class Depths:
             return
         down, right = np.mgrid[-radius : radius + 1, -radius : radius + 1]
         circle = (np.hypot(down, right) <= self._gap_px + 0.25).astype(np.uint8)
-        with np.errstate(divide="ignore"):
-            # beyond its sides the picture goes on as it ends there; else slopes would be lifted along them
-            rim = 2 * radius
-            near = np.asarray(cv2.copyMakeBorder(1.0 / self.nearest, rim, rim, rim, rim, cv2.BORDER_REPLICATE))
-            closed = np.asarray(cv2.morphologyEx(near, cv2.MORPH_CLOSE, circle))[rim:-rim, rim:-rim]
-            self.nearest = np.minimum(self.nearest, 1.0 / closed)
+        # beyond its sides the picture goes on as it ends there; else slopes would be lifted along them
+        rim = 2 * radius
+        near = cv2.copyMakeBorder(self._near, rim, rim, rim, rim, cv2.BORDER_REPLICATE)
+        closed = np.asarray(cv2.morphologyEx(near, cv2.MORPH_CLOSE, circle))[rim:-rim, rim:-rim]
+        np.maximum(self._near, closed, out=self._near)
 
-    def sees(self, seen: Seen, surface: Surface, place_m: Array) -> npt.NDArray[np.bool_]:
-        """Which of some points nothing hides, shape (k,); parameters as of `add`."""
-        out = np.empty(len(seen.number), np.bool_)
-        _sees(seen, surface, place_m, (self._scale, self._focal), self._turning, (self.nearest, self._facing), out)
-        return out
+    def sees(self, seen: Seen, surface: Surface, place_m: Array) -> Seen:
+        """Those of some points that nothing hides; parameters as of `add`."""
+        out = Seen(np.empty_like(seen.number), np.empty_like(seen.pixel), np.empty_like(seen.range_m))
+        depths = self._near, self._facing
+        count = _sees(seen, surface, place_m, (self._scale, self._focal), self._turning, depths, out)
+        return Seen(out.number[:count], out.pixel[:count], out.range_m[:count])
 
 
 def _turning(eye: Eye) -> Array:
@@ -201,25 +210,26 @@ def _turning(eye: Eye) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _project(eye: Any, xyz: Any, number: Any, pixel: Any, ranges: Any) -> int:
+def _project(eye: Any, xyz: Any, spans: Any, number: Any, pixel: Any, ranges: Any) -> int:
     count = 0
     ray, place = np.empty(3), np.empty(2)
     mat, at = eye.mat_cam_local, eye.place_m
     right, down = eye.size_px[0] - 0.5, eye.size_px[1] - 0.5
     late = mat @ eye.row_m
     rolls, middle = (eye.row_m != 0.0).any(), 0.5 * (eye.size_px[1] - 1)
-    for i in range(len(xyz)):
-        x, y, z = xyz[i, 0] - at[0], xyz[i, 1] - at[1], xyz[i, 2] - at[2]
-        for row in range(3):
-            ray[row] = mat[row, 0] * x + mat[row, 1] * y + mat[row, 2] * z
-        reached = projected(eye.kind, eye.lens, ray, place)
-        if rolls and reached:
-            reached = _rolled(eye, ray, late, middle, place)
-        if reached and -0.5 <= place[0] <= right and -0.5 <= place[1] <= down:
-            number[count] = i
-            pixel[count, 0], pixel[count, 1] = place[0], place[1]
-            ranges[count] = np.sqrt(x * x + y * y + z * z)
-            count += 1
+    for span in range(len(spans)):
+        for i in range(spans[span, 0], spans[span, 1]):
+            x, y, z = xyz[i, 0] - at[0], xyz[i, 1] - at[1], xyz[i, 2] - at[2]
+            for row in range(3):
+                ray[row] = mat[row, 0] * x + mat[row, 1] * y + mat[row, 2] * z
+            reached = projected(eye.kind, eye.lens, ray, place)
+            if rolls and reached:
+                reached = _rolled(eye, ray, late, middle, place)
+            if reached and -0.5 <= place[0] <= right and -0.5 <= place[1] <= down:
+                number[count] = i
+                pixel[count, 0], pixel[count, 1] = place[0], place[1]
+                ranges[count] = np.sqrt(x * x + y * y + z * z)
+                count += 1
     return count
 
 
@@ -237,114 +247,177 @@ def _rolled(eye: Any, ray: Any, late: Any, middle: float, place: Any) -> bool:
     return reached
 
 
-@njit(cache=True, nogil=True)
-def _node(pixel: Any, scale: float, nearest: Any) -> tuple[int, int]:
-    """Row and column of the node that a pixel is next to."""
-    row = int((pixel[1] + 0.5) * scale / nearest.shape[0] * _NODES)
-    column = int((pixel[0] + 0.5) * scale / nearest.shape[1] * _NODES)
+# What a point is and where it is goes from one kernel to the next as tuples of numbers: arrays would be counted, at every call.
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _triple(rows: Any, i: int) -> tuple[float, float, float]:
+    return np.float64(rows[i, 0]), np.float64(rows[i, 1]), np.float64(rows[i, 2])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _way(xyz: Any, i: int, place: Any) -> tuple[float, float, float]:
+    return xyz[i, 0] - place[0], xyz[i, 1] - place[1], xyz[i, 2] - place[2]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _dot(a: Any, b: Any) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _node(u: float, v: float, shape: Any) -> tuple[int, int]:
+    """Row and column of the node that a place in a depth image is next to."""
+    row, column = int(v / shape[0] * _NODES), int(u / shape[1] * _NODES)
     return min(max(row, 0), _NODES - 1), min(max(column, 0), _NODES - 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _facing(surface: Any, point: int, place: Any, turning: Any, out: Any) -> bool:
-    """The plane of a point as rays meet it: cosine, its changes from pixel to pixel, distance across; False where it has none.
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _facing(normal: Any, way: Any, above: float, right: Any, below: Any) -> tuple[float, float, float, float, float]:
+    """The plane of a point as rays meet it: cosine, its changes from pixel to pixel, distance across, and how long its normal is.
 
     The distance along the ray so many pixels to the right and below that of the point is
-    out[3] / (out[0] + out[1] right + out[2] below). out[4:7] is the way to the point.
+    across / (cosine + by_u right + by_v below). Of a point without a plane the normal has no length, and the others are no numbers.
     """
-    square = 0.0
-    out[:4] = 0.0
-    for axis in range(3):
-        normal = np.float64(surface.normal[point, axis])
-        way = surface.xyz_m[point, axis] - place[axis]
-        square += normal * normal
-        out[0] += normal * way
-        out[1] += normal * turning[0, axis]
-        out[2] += normal * turning[1, axis]
-        out[4 + axis] = way
-    if square < 0.1:
-        return False
-    length = np.sqrt(square)
-    distance = np.sqrt(out[4] ** 2 + out[5] ** 2 + out[6] ** 2)
-    out[3] = out[0] / length - surface.above_m[point]
-    out[0] /= length * distance
-    out[1] /= length
-    out[2] /= length
-    return True
+    length = np.sqrt(_dot(normal, normal))
+    across = _dot(normal, way) / length
+    cosine = across / np.sqrt(_dot(way, way))
+    return cosine, _dot(normal, right) / length, _dot(normal, below) / length, across - above, length
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any) -> None:
-    nearest, facing = depths
-    height, width = nearest.shape
+    near, facing = depths
+    xyz, spacing, normals, above = surface.xyz_m, surface.spacing_m, surface.normal, surface.above_m
+    number, pixel, ranges, shape = seen.number, seen.pixel, seen.range_m, near.shape
     scale, focal = scales
-    plane = np.empty(7)
-    for i in range(len(seen.number)):
-        point, distance = seen.number[i], float(seen.range_m[i])
-        reach = min(_REACH * surface.spacing_m[point], WIDEST_PX * distance / focal)
-        radius, inverse = reach * focal / distance, 1.0 / distance
-        u, v = (seen.pixel[i, 0] + 0.5) * scale, (seen.pixel[i, 1] + 0.5) * scale
-        down, across = _node(seen.pixel[i], scale, nearest)
-        turn = turning[down, across]
-        flat = _facing(surface, point, place, turn, plane)
-        left, right = max(0, int(u - radius)), min(width - 1, int(u + radius))
-        top, bottom = max(0, int(v - radius)), min(height - 1, int(v + radius))
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                du, dv = column + 0.5 - u, row + 0.5 - v
-                far, cosine = distance, 0.0
-                if flat:
-                    cosine = plane[0] + du * plane[1] + dv * plane[2]
-                    far = plane[3] / cosine
-                    own = row == int(v) and column == int(u)
-                    if not own and not far < nearest[row, column]:
-                        continue
-                    off = 0.0
-                    for axis in range(3):
-                        ray = plane[4 + axis] * inverse + du * turn[0, axis] + dv * turn[1, axis]
-                        off += (far * ray - plane[4 + axis]) ** 2
-                    inside = off <= reach * reach
-                else:
-                    inside = du * du + dv * dv <= radius * radius
-                if not inside:
-                    if row != int(v) or column != int(u):
-                        continue
-                    far = distance
-                if far < nearest[row, column]:
-                    nearest[row, column], facing[row, column] = far, abs(cosine)
+    for i in range(len(number)):
+        point, inverse = number[i], 1.0 / np.float64(ranges[i])
+        u, v = (pixel[i, 0] + 0.5) * scale, (pixel[i, 1] + 0.5) * scale
+        reach = min(_REACH * spacing[point], WIDEST_PX / (focal * inverse))
+        radius = reach * focal * inverse
+        row, column = _node(u, v, shape)
+        right, below = _triple(turning[row, column], 0), _triple(turning[row, column], 1)
+        way = _way(xyz, point, place)
+        plane = _facing(_triple(normals, point), way, np.float64(above[point]), right, below)
+        if plane[4] > 0.3:
+            shape_ = plane[0], plane[1], plane[2], reach
+            _disc(shape_, (way, right, below), (u, v, radius), (inverse, plane[3]), near, facing)
+        else:
+            _round((u, v, radius), inverse, near, facing)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _sides(at: float, radius: float, size: int) -> tuple[int, int]:
+    """First pixel about a place, and that after the last one."""
+    return max(0, int(at - radius)), min(size, int(at + radius) + 1)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _round(at: Any, inverse: float, near: Any, facing: Any) -> None:
+    """A disc that faces the camera, at least its own pixel."""
+    u, v, radius = at
+    top, bottom = _sides(v, radius, near.shape[0])
+    left, beyond = _sides(u, radius, near.shape[1])
+    for row in range(top, bottom):
+        for column in range(left, beyond):
+            du, dv = column + 0.5 - u, row + 0.5 - v
+            inside = du * du + dv * dv <= radius * radius or (row == int(v) and column == int(u))
+            if inside and inverse > near[row, column]:
+                near[row, column], facing[row, column] = inverse, 0.0
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _disc(plane: Any, ways: Any, at: Any, terms: Any, near: Any, facing: Any) -> None:
+    """A disc in a plane, at least its own pixel.
+
+    A ray meets the plane at 1 / w. It is inside where | ray / w - way | <= reach; times w that is
+    | (inverse - w) way + du right + dv below |^2 - (reach w)^2 <= 0. As w is linear in du and dv, that is a polynomial of second degree.
+    """
+    u, v, radius = at
+    inverse, across = terms
+    w0, wu, wv = plane[0] / across, plane[1] / across, plane[2] / across
+    c, cu, cv, cuu, cuv, cvv = _rim(ways, inverse, (w0, wu, wv), plane[3] * plane[3])
+    top, bottom = _sides(v, radius, near.shape[0])
+    left, beyond = _sides(u, radius, near.shape[1])
+    for row in range(top, bottom):
+        dv = row + 0.5 - v
+        start, slope, first = c + dv * (cv + dv * cvv), cu + dv * cuv, w0 + dv * wv
+        for column in range(left, beyond):
+            du = column + 0.5 - u
+            w = first + du * wu
+            if (w > near[row, column]) & (start + du * (slope + du * cuu) <= 0.0):
+                near[row, column] = w
+                facing[row, column] = abs(w * across)
+    row, column = int(v), int(u)
+    if inverse > near[row, column]:
+        du, dv = column + 0.5 - u, row + 0.5 - v
+        w = w0 + du * wu + dv * wv
+        inside = c + du * (cu + du * cuu) + dv * (cv + du * cuv + dv * cvv) <= 0.0
+        if not (inside and w > 0.0):  # else it has been laid, farther than the point or not
+            near[row, column] = inverse
+            facing[row, column] = abs(w * across)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _rim(ways: Any, inverse: float, w: Any, square: float) -> tuple[float, float, float, float, float, float]:
+    """The polynomial that is 0 at the rim of a disc: constant, du, dv, du du, du dv, dv dv."""
+    way, right, below = ways
+    s, ww, wu, wv = inverse - w[0], _dot(way, way), _dot(way, right), _dot(way, below)
+    # the vector is s way + du (right - w[1] way) + dv (below - w[2] way)
+    along_u, along_v = wu - w[1] * ww, wv - w[2] * ww
+    uu = _dot(right, right) - w[1] * (wu + along_u)
+    uv = _dot(right, below) - w[2] * wu - w[1] * along_v
+    vv = _dot(below, below) - w[2] * (wv + along_v)
+    return (
+        s * s * ww - square * w[0] * w[0], 2.0 * (s * along_u - square * w[0] * w[1]), 2.0 * (s * along_v - square * w[0] * w[2]),
+        uu - square * w[1] * w[1], 2.0 * (uv - square * w[1] * w[2]), vv - square * w[2] * w[2],
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sees(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any, out: Any) -> None:
+def _sees(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any, out: Any) -> int:
     nearest, facing = depths
+    xyz, spacing, normals, above, rough = (
+        surface.xyz_m,
+        surface.spacing_m,
+        surface.normal,
+        surface.above_m,
+        surface.rough_m,
+    )
+    number, pixel, ranges, shape = seen.number, seen.pixel, seen.range_m, nearest.shape
+    out_number, out_pixel, out_range = out.number, out.pixel, out.range_m
     scale, focal = scales
-    plane = np.empty(7)
-    for i in range(len(seen.range_m)):
-        point, distance = seen.number[i], np.float64(seen.range_m[i])
-        u, v = (seen.pixel[i, 0] + 0.5) * scale, (seen.pixel[i, 1] + 0.5) * scale
+    count = 0
+    for i in range(len(number)):
+        point, distance = number[i], np.float64(ranges[i])
+        u, v = (pixel[i, 0] + 0.5) * scale, (pixel[i, 1] + 0.5) * scale
+        row, column = _node(u, v, shape)
+        right, below = _triple(turning[row, column], 0), _triple(turning[row, column], 1)
+        plane = _facing(_triple(normals, point), _way(xyz, point, place), np.float64(above[point]), right, below)
         row, column = int(v), int(u)
-        down, across = _node(seen.pixel[i], scale, nearest)
-        near = np.float64(nearest[row, column])
-        if not _facing(surface, point, place, turning[down, across], plane):
-            aside = _REACH * surface.spacing_m[point] + distance / focal  # of the nearest one from this one, at most
-            out[i] = distance - near <= ROUGH_M + 0.5 * aside
-            continue
-        known = _length2(surface, point) > 0.5
-        if known and 0.0 < plane[0] < _STEEP:
-            out[i] = False
-            continue
-        reach = _REACH * surface.spacing_m[point]
-        cosine = plane[0] + (column + 0.5 - u) * plane[1] + (row + 0.5 - v) * plane[2]
-        far = plane[3] / cosine if abs(cosine) >= _GRAZING else distance
-        far = min(max(far, distance - reach), distance + reach)  # farther along the plane there may be no surface
-        # neither may lie off the other's plane: an eave is near the plane of the wall below it, not so the wall
-        across = max(abs(cosine), np.float64(facing[row, column]), _GRAZING)
-        slack = PLANE_M + _NOISE * surface.rough_m[point]
-        out[i] = far - near <= min(slack / across, _DEEPEST_M)
+        pixel_ = 1.0 / np.float64(nearest[row, column]), np.float64(facing[row, column])
+        sizes = _REACH * spacing[point], distance / focal, np.float64(rough[point])
+        if _clear(plane, distance, (column + 0.5 - u, row + 0.5 - v), pixel_, sizes):
+            out_number[count], out_range[count] = point, ranges[i]
+            out_pixel[count, 0], out_pixel[count, 1] = pixel[i, 0], pixel[i, 1]
+            count += 1
+    return count
 
 
-@njit(cache=True, nogil=True)
-def _length2(surface: Any, point: int) -> float:
-    """Square of the length of a point's normal."""
-    x, y, z = surface.normal[point, 0], surface.normal[point, 1], surface.normal[point, 2]
-    return float(x * x + y * y + z * z)
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _clear(plane: Any, distance: float, off: Any, pixel: Any, sizes: Any) -> bool:
+    """Whether nothing hides a point: its plane, how far the middle of its pixel is off, depth and cosine there, and its sizes."""
+    near, facing = pixel
+    reach, pixel_m, rough_m = sizes
+    if not plane[4] > 0.3:
+        return bool(distance - near <= ROUGH_M + 0.5 * (reach + pixel_m))  # of the nearest one from this one, at most
+    if plane[4] > 0.7 and 0.0 < plane[0] < _STEEP:
+        return False
+    cosine = plane[0] + off[0] * plane[1] + off[1] * plane[2]
+    far = plane[3] / cosine if abs(cosine) >= _GRAZING else distance
+    far = min(max(far, distance - reach), distance + reach)  # farther along the plane there may be no surface
+    # neither may lie off the other's plane: an eave is near the plane of the wall below it, not so the wall
+    across = max(abs(cosine), facing, _GRAZING)
+    slack = PLANE_M + _NOISE * rough_m
+    return bool(far - near <= min(slack / across, _DEEPEST_M))
