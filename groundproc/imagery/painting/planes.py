@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy import ndimage
 
 from groundproc.numerics.planes import flattest
 from groundproc.numerics.voxelhash import around, numbered, table_for
@@ -16,7 +17,9 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
 
 COLUMN_M: Final = 0.5
-"""Side of the columns of ground whose tops tell which side of a wall is outside."""
+"""Side of the columns of ground whose tops tell which side of a wall is outside; wider where points are fewer."""
+_FILLED: Final = 2.5
+"""Spacings that a column is wide, at least: of points at random one column in 500 is then empty."""
 _SIDE: Final = 3.5
 """Of a cell, in usual spacings of the points."""
 _LEAST: Final = 6
@@ -29,7 +32,8 @@ _SMOOTH: Final = 1.5
 """A cell that is rougher than so many times the usual may hold more than one surface."""
 _ON: Final = 3.0
 """Deviations from a neighbouring cell's plane at which a point still lies on it."""
-_STEP_M: Final = 0.75
+_STEP: Final = 1.5
+"""Columns ahead of a wall and behind it."""
 _LOWER_M: Final = 0.5
 """A wall looks to the side where the top of everything, so far away from it, is so much lower than on its other side."""
 
@@ -63,12 +67,20 @@ class _Cells(NamedTuple):
     middle_m: Array
 
 
-def columns(xyz_m: Array) -> tuple[Ints, tuple[int, int]]:
+class _Tops(NamedTuple):
+    """The highest point of each column of ground; -inf where there is none. `low` is the number of the first column both ways."""
+
+    wide_m: float
+    low: Array
+    top_m: Array
+
+
+def columns(xyz_m: Array, wide_m: float = COLUMN_M) -> tuple[Ints, tuple[int, int]]:
     """The column of ground that each point, shape (n, 3), stands in, row by row, and how many there are both ways."""
-    low = np.floor(xyz_m[:, :2].min(axis=0) / COLUMN_M)
-    rows, across = (np.floor(xyz_m[:, :2].max(axis=0) / COLUMN_M) - low).astype(int) + 1
+    low = np.floor(xyz_m[:, :2].min(axis=0) / wide_m)
+    rows, across = (np.floor(xyz_m[:, :2].max(axis=0) / wide_m) - low).astype(int) + 1
     out = np.empty(len(xyz_m), np.int32)
-    _columns(xyz_m, low, int(across), out)
+    _columns(xyz_m, low, int(across), wide_m, out)
     return out, (int(rows), int(across))
 
 
@@ -78,8 +90,7 @@ def surfaces(xyz_m: Array, known: Known) -> float:
     Of two grids of cells, one half a cell off: a plane that lies along the border of the cells of one lies within those of the other. A
     cell at an edge holds points of two surfaces. Those take the best plane among their cell's and its neighbours' that they lie on.
     """
-    tops = _tops(xyz_m)
-    usual_m = float(np.sqrt(np.count_nonzero(np.isfinite(tops[0])) * COLUMN_M**2 / len(xyz_m)))
+    tops, usual_m = _tops(xyz_m)
     grids = [_cells(xyz_m, _SIDE * usual_m, offset, tops) for offset in (0.0, 0.5)]
     smooth = [cells.rough_m[(cells.normal != 0.0).any(axis=1)] for cells, _ in grids]
     usual_rough_m = float(np.median(np.concatenate(smooth))) if sum(map(len, smooth)) else 0.0
@@ -93,7 +104,7 @@ def surfaces(xyz_m: Array, known: Known) -> float:
     return usual_m
 
 
-def _cells(xyz_m: Array, cell_m: float, offset: float, tops: tuple[Array, Array]) -> tuple[_Cells, Ints]:
+def _cells(xyz_m: Array, cell_m: float, offset: float, tops: _Tops) -> tuple[_Cells, Ints]:
     """The cells of one grid, and the cell of each point."""
     table = table_for(2 * len(xyz_m))
     of_point, keys, count = numbered(xyz_m + offset * cell_m, 1.0 / cell_m, table)
@@ -106,9 +117,9 @@ def _cells(xyz_m: Array, cell_m: float, offset: float, tops: tuple[Array, Array]
 
 
 @njit(cache=True, nogil=True)
-def _columns(xyz: Any, low: Any, across: int, out: Any) -> None:
+def _columns(xyz: Any, low: Any, across: int, wide_m: float, out: Any) -> None:
     for i in range(len(xyz)):
-        row, column = np.floor(xyz[i, 0] / COLUMN_M) - low[0], np.floor(xyz[i, 1] / COLUMN_M) - low[1]
+        row, column = np.floor(xyz[i, 0] / wide_m) - low[0], np.floor(xyz[i, 1] / wide_m) - low[1]
         out[i] = np.int32(row) * across + np.int32(column)
 
 
@@ -170,12 +181,22 @@ def _spacings(ones: Any, of_one: Any, others: Any, of_other: Any, side_m: float,
         out[i] = side_m / np.sqrt(max(ones[of_one[i]], others[of_other[i]]))
 
 
-def _tops(xyz_m: Array) -> tuple[Array, Array]:
-    """The highest point of each column of ground, and the number of the first column both ways."""
-    of_point, shape = columns(xyz_m)
-    top = np.full(shape[0] * shape[1], -np.inf)
-    _highest(xyz_m, of_point, top)
-    return top.reshape(shape), np.floor(xyz_m[:, :2].min(axis=0) / COLUMN_M)
+def _tops(xyz_m: Array) -> tuple[_Tops, float]:
+    """The tops of columns so wide that few are empty, and the usual spacing of points seen from above."""
+    wide_m = COLUMN_M
+    while True:
+        of_point, shape = columns(xyz_m, wide_m)
+        top = np.full(shape[0] * shape[1], -np.inf)
+        _highest(xyz_m, of_point, top)
+        usual_m = float(wide_m * np.sqrt(np.count_nonzero(np.isfinite(top)) / len(xyz_m)))
+        if _FILLED * usual_m <= wide_m or max(shape) == 1:
+            break
+        wide_m *= 2.0
+    found = top.reshape(shape)
+    empty = ~np.isfinite(found)
+    if empty.any():  # one column without points between others is no pit
+        found = np.where(empty, ndimage.maximum_filter(found, 3, mode="nearest"), found)
+    return _Tops(wide_m, np.floor(xyz_m[:, :2].min(axis=0) / wide_m), found), usual_m
 
 
 @njit(cache=True, nogil=True)
@@ -227,15 +248,16 @@ def _planes(points: Any, spread: Any, normal: Any, rough: Any) -> None:
             rough[c] = np.sqrt(least * points[c] / (points[c] - 3.0))  # a plane takes three of the points' freedoms
 
 
-def _outwards(normal: Array, middle_m: Array, tops: tuple[Array, Array]) -> Array:
+def _outwards(normal: Array, middle_m: Array, tops: _Tops) -> Array:
     """Normals turned outwards: up, and of walls to where there is less."""
-    top, first = tops
+    top = tops.top_m
     wall = (np.abs(normal[:, 2]) < _UPRIGHT) & (normal != 0.0).any(axis=1)
     out = np.where(normal[:, 2:] < 0.0, -normal, normal)
     across = out[wall, :2] / np.linalg.norm(out[wall, :2], axis=1, keepdims=True)
 
     def height(sign: float) -> Array:
-        column = (np.floor((middle_m[wall, :2] + sign * _STEP_M * across) / COLUMN_M) - first).astype(np.int64)
+        place = middle_m[wall, :2] / tops.wide_m + sign * _STEP * across
+        column = (np.floor(place) - tops.low).astype(np.int64)
         inside = ((column >= 0) & (column < top.shape)).all(axis=1)
         column[~inside] = 0
         return np.where(inside, top[column[:, 0], column[:, 1]], np.nan)

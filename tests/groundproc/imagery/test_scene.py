@@ -13,7 +13,6 @@ from groundproc.imagery.painting.scene import Scene, localised, side_by_side, to
 from groundproc.imagery.painting.visibility import project
 from groundproc.imagery.site import cartesian
 
-
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
