@@ -74,6 +74,21 @@ def loose(track: Track) -> Mask:
     return np.asarray(misleading(track) | _silent(track))
 
 
+def along_untold_s(track: Track) -> float:
+    """Seconds of the longest stretch over which a single direction of the way is missing most of the time, as along plain walls.
+
+    Here and there a slice seems to tell it: planes that lean by chance do.
+    """
+    single = unheld(track) & ~loose(track)
+    if not len(single):
+        return 0.0
+    width = min(SHORTEST, len(single))
+    most = np.convolve(single, np.ones(width), mode="valid") > 0.5 * width
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], most, [False]])))
+    longest = int(np.diff(edges.reshape(-1, 2), axis=1).max(initial=0))
+    return (longest + width - 1) * SLICE_NS * 1e-9 if longest else 0.0
+
+
 def holds_somewhere(track: Track) -> bool:
     """Whether there is a stretch long enough to be worth keeping in which the lidar tells the way, but perhaps for one direction.
 

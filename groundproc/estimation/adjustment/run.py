@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from flightlog.mount import Mount
-from groundproc.estimation.adjustment.bridging import bridged, holds_somewhere, loose, stretches, unheld
+from groundproc.estimation.adjustment.bridging import along_untold_s, bridged, holds_somewhere, loose, stretches, unheld
 from groundproc.estimation.adjustment.joining import Joined
 from groundproc.estimation.adjustment.sensorpath import lost, of_ins
 from groundproc.estimation.adjustment.windows import (
@@ -36,6 +36,8 @@ Array = npt.NDArray[np.float64]
 
 UNSETTLED_M: Final = 0.03
 """A last step larger than this is worth a warning."""
+UNTOLD_S: Final = 10.0
+"""So long with one direction of the way missing is worth a warning: over less, inertial data between two good ends keep decimetres."""
 
 
 @dataclass(slots=True)
@@ -146,10 +148,22 @@ class Run:
             found.append(
                 f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
             )
+        found += self._untold()
         outcome = self.outcome()
         # several legs have one and the same thing to say
         said = dict.fromkeys(sentence for each in self.sources.observations for sentence in each.warnings(outcome))
         return [*found, *said]
+
+    def _untold(self) -> list[str]:
+        """One sentence where the lidar leaves one direction of the way open for long, and nothing better than GNSS tells it."""
+        seconds = along_untold_s(self.track)
+        if seconds < UNTOLD_S or self.is_worse() or self.sources.leads():
+            return []
+        sentence = (
+            f"for {seconds:.0f} s on end the lidar does not tell one direction of the way, as along plain walls or a bank: there the path "
+            "has it from inertial sensors and GNSS and may be metres off along it; --positions of a better receiver would hold it"
+        )
+        return [sentence]
 
     def outcome(self) -> Outcome:
         """What came of it, for the observations to report on."""

@@ -84,3 +84,16 @@ def test_mount_and_lasers_are_those_that_the_trajectory_was_made_with(misled: bo
     # the lever arm's covariance in the ins frame, by the nose-down mount
     lever = mount.mat_ins_lidar() @ np.diag(np.square([0.004, 0.005, 0.006]) + 0.003**2) @ mount.mat_ins_lidar().T
     np.testing.assert_allclose(sigma.position_m, np.sqrt(np.diag(lever)))
+
+
+@pytest.mark.parametrize(
+    ("unheld_m", "outside", "warned"), [(0.16, (), True), (0.02, (), False), (0.16, ("ppk.pos",), False)]
+)
+def test_a_way_that_walls_do_not_tell_is_a_warning_unless_better_positions_do(
+    unheld_m: float, outside: tuple[str, ...], warned: bool
+) -> None:
+    run = run_with(0, 2.0, outside)
+    run.track.unheld_m = [unheld_m] * 300
+    run.track.matched, run.track.next_unheld_m = [500] * 300, [0.004] * 300
+    said = [sentence for sentence in run.warnings() if "one direction of the way" in sentence]
+    assert bool(said) is warned

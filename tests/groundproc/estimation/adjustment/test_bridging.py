@@ -14,6 +14,7 @@ from groundproc.estimation.adjustment.bridging import (
     SHORTEST,
     START,
     Stretch,
+    along_untold_s,
     bridged,
     holds_somewhere,
     misleading,
@@ -169,6 +170,23 @@ def test_a_single_direction_that_is_not_told_leaves_the_others_to_the_adjustment
     assert not misleading(street).any()
     assert unheld(street).sum() == 200 - START
     assert misleading(seen(200, 10.0 * TELLS_M, 2.0 * TELLS_M)).sum() == 200 - START
+
+
+@pytest.mark.parametrize(
+    ("open_share", "seconds"),
+    [(1.0, 20.0), (0.8, 20.0), (0.3, 0.0), (0.0, 0.0)],
+)
+def test_a_street_without_anything_across_it_is_told_though_planes_that_lean_seem_to_hold_it_at_times(
+    open_share: float, seconds: float
+) -> None:
+    track = seen(400, 0.02, 0.004)
+    untold = np.full(400, 0.02)
+    untold[100:300] = np.where((np.arange(200) % 10) < 10 * open_share, 0.16, 0.02)
+    track.unheld_m = untold.tolist()
+    # what lies within half of ten seconds of it counts too
+    assert along_untold_s(track) == pytest.approx(seconds, abs=10.1 if seconds else 0.0)
+    track.next_unheld_m = [0.2] * 400
+    assert along_untold_s(track) == 0.0  # two directions: that is bridged
 
 
 def test_who_has_led_astray_is_believed_where_he_is_sure() -> None:
