@@ -11,9 +11,10 @@ from flightlog import frames
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.imagery.assembly import Known
-from groundproc.imagery.bundle.block import Block, PosePriors, Stations
+from groundproc.imagery.bundle.block import Block, Common, PosePriors, Stations
 from groundproc.imagery.poses import NO_TIME
 from groundproc.imagery.rig import Rig
+from groundproc.imagery.rotations import cross_matrix
 from groundproc.trajectory.covariance import mat_attitude_turn
 from groundproc.trajectory.estimate import TRAJECTORY, is_estimate, read_estimate
 from groundproc.trajectory.table import read_trajectory
@@ -31,6 +32,7 @@ LATE_SIGMA_S: Final = 0.01
 """By how much an autopilot's attitudes may be later than places: what filters of gyros delay them."""
 OF_AUTOPILOT: Final = ("filtered", "ins")
 """Methods whose attitudes are the autopilot's; one clock is behind all that others find."""
+LEAST_SHARE: Final = 0.01
 PLAIN_PLACE_M: Final = (0.1, 0.1, 0.15)
 PLAIN_TURN_RAD: Final = float(np.deg2rad(0.3))
 """Of a trajectory that states no sigmas."""
@@ -62,7 +64,7 @@ class Sampled:
     place_m, mat_local_ins, velocity_m_s, rate_rad_s : ndarray, shapes (n, 3), (n, 3, 3), (n, 3), (n, 3)
         The rate is that of the ins in its own frame.
     covariance : ndarray, shape (n, 6, 6)
-        Place [m] and turn in the local frame [rad].
+        Place [m] and turn in the local frame [rad], beside the datum that all poses share.
     covered : ndarray of bool, shape (n,)
     stated : bool
         Whether the trajectory states sigmas.
@@ -89,12 +91,27 @@ def sample(trajectory: Trajectory, time_ns: Ints) -> Sampled:
     velocity = np.where(covered[:, None], (after.position_m - before.position_m) / seconds, 0.0)
     rate = frames.quat_log(frames.quat_multiply(frames.quat_inverse(quats[0]), quats[2])) / seconds
     mat = frames.mat_from_quat(quats[1])
-    covariance, stated = _covariance(trajectory, time_ns, mat, covered)
     place = np.where(covered[:, None], poses.position_m, 0.0)
+    covariance, stated = _covariance(trajectory, time_ns, mat, place, covered)
     return Sampled(place, mat, velocity, rate, covariance, covered, stated)
 
 
-def _covariance(trajectory: Trajectory, time_ns: Ints, mat: Array, covered: Mask) -> tuple[Array, bool]:
+def of_datum(datum: Array, place_m: Array) -> Array:
+    """Covariance that a shift and a turn about the origin give poses at places, shape (n, 6, 6)."""
+    by = np.tile(np.eye(6), (len(place_m), 1, 1))
+    by[:, :3, 3:] = -cross_matrix(place_m)
+    return np.asarray(by @ datum @ np.swapaxes(by, 1, 2))
+
+
+def _beside(covariance: Array, common: Array) -> Array:
+    """What covariances hold beside their common part, shape (n, 6, 6); nothing is known better than `LEAST_SHARE` of its variance."""
+    size = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    unit = size[:, :, None] * size[:, None, :]
+    value, axis = np.linalg.eigh((covariance - common) / unit)
+    return np.asarray(unit * ((axis * np.maximum(value, LEAST_SHARE)[:, None, :]) @ np.swapaxes(axis, 1, 2)))
+
+
+def _covariance(trajectory: Trajectory, time_ns: Ints, mat: Array, place: Array, covered: Mask) -> tuple[Array, bool]:
     """Covariance of place and turn; that of roll, pitch and heading is turned into one about east, north and up."""
     inside = np.clip(time_ns, trajectory.time_ns[0], trajectory.time_ns[-1])
     found = trajectory.covariance_at(inside)
@@ -109,6 +126,8 @@ def _covariance(trajectory: Trajectory, time_ns: Ints, mat: Array, covered: Mask
     good = np.asarray(np.isfinite(found).all(axis=(1, 2)))
     found = np.where(good[:, None, None], found, plain)
     turned = full @ found @ np.swapaxes(full, 1, 2)
+    if trajectory.datum is not None:
+        turned = _beside(turned, of_datum(trajectory.datum, place))
     turned[:, np.arange(3), np.arange(3)] += _LEAST_PLACE_M**2
     turned[:, np.arange(3, 6), np.arange(3, 6)] += _LEAST_TURN_RAD**2
     return turned, stated
@@ -164,15 +183,18 @@ def stations_of(trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints) -
     priors = PosePriors(
         rows, sampled.place_m[rows], sampled.mat_local_ins[rows], sampled.covariance[rows], np.zeros((len(rows), 3)),
         sampled.velocity_m_s[rows], np.einsum("kij,kj->ki", sampled.mat_local_ins[rows], sampled.rate_rad_s[rows]),
-        np.ones(len(rows)),
+        np.ones(len(rows)), common=Common(covariance=trajectory.datum),
     )  # fmt: skip
     covered = sampled.covered[station]
     return Known(covered.copy(), stations, station, priors), covered
 
 
-def with_lateness(block: Block, sigma_s: float) -> Block:
-    """The block with attitudes that may be later than places: once its clocks are found, for one is taken for the other before."""
-    common = replace(block.priors.common, late_sigma_s=sigma_s)
+def with_lateness(block: Block, sigma_s: float, own_cloud: bool) -> Block:
+    """The block with attitudes that may be later than places, and a cloud that was made with them or not.
+
+    Not before its clocks are found, for one is taken for the other.
+    """
+    common = replace(block.priors.common, late_sigma_s=sigma_s, cloud=own_cloud)
     return replace(block, priors=replace(block.priors, common=common))
 
 

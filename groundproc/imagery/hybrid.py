@@ -20,6 +20,7 @@ from groundproc.geodesy import LocalFrame
 from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.covariance import Cofactors, of_columns
 from groundproc.imagery.bundle.unknowns import Unknowns
+from groundproc.imagery.flown import of_datum
 from groundproc.imagery.rotations import mat_of_vector
 from groundproc.trajectory.covariance import STATES, mat_attitude_turn
 from groundproc.trajectory.estimate import COVARIANCE, TRAJECTORY
@@ -61,9 +62,12 @@ def gained(block: Block, unknowns: Unknowns, found: Cofactors, sigma0: float) ->
     priors, stations = block.priors, block.stations
     shift_s = np.array([one.timeshift_s for one in block.rig.cameras])
     time_ns = stations.time_ns[priors.station] + np.rint(shift_s[stations.lead[priors.station]] * 1e9).astype(np.int64)
+    known = priors.covariance
+    if priors.common.covariance is not None:
+        known = known + of_datum(priors.common.covariance, priors.place_m)
     place, mats, covariances = [], [], []
     for row, station in enumerate(priors.station.tolist()):
-        before = priors.covariance[row]
+        before = known[row]
         after = sigma0**2 * of_columns(found.matrix, unknowns.station[station])
         turn = frames.quat_log(frames.quat_from_mat(stations.mat_local_ins[station] @ priors.mat_local_ins[row].T))
         moved = np.concatenate([stations.place_m[station] - priors.place_m[row], turn])

@@ -158,7 +158,15 @@ def common_of(adjusted: Adjusted) -> dict[str, Any]:
     solved = adjusted.solved
     column = int(solved.unknowns.common[0])
     sigma = scale_of(adjusted) * np.sqrt(adjusted.found.matrix[column, column]) if column >= 0 else np.nan
-    return {"attitudes_late_s": solved.block.priors.common.late_s, "attitudes_late_sigma_s": _number(sigma)}
+    told = {"attitudes_late_s": solved.block.priors.common.late_s, "attitudes_late_sigma_s": _number(sigma)}
+    columns = solved.unknowns.common[1:4]
+    if (columns < 0).any():
+        return told
+    spread = scale_of(adjusted) * np.sqrt(np.diag(adjusted.found.matrix)[columns])
+    return told | {
+        "trajectory_shift_m": solved.block.priors.common.moved[:3].tolist(),
+        "trajectory_shift_sigma_m": spread.tolist(),
+    }
 
 
 def _number(value: Any) -> float | None:

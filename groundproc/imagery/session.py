@@ -92,6 +92,8 @@ class Session:
     trajectory : Trajectory, optional
     late_sigma_s : float
         By how much its attitudes may be later than its places.
+    own_cloud : bool
+        The cloud lies in the folder of the trajectory, which it was made with.
     site : Site
     timed : Timed, optional
         By which events times were found.
@@ -112,6 +114,7 @@ class Session:
     start: ImagePoses | None = None
     trajectory: Trajectory | None = None
     late_sigma_s: float = 0.0
+    own_cloud: bool = False
     site: Site = field(default_factory=lambda: cartesian(np.zeros((1, 3))))
     timed: Timed | None = None
     lasting: Lasting = field(default_factory=Lasting)
@@ -216,6 +219,8 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
         session.late_sigma_s = flown.LATE_SIGMA_S
     elif task.trajectory is not None:
         session.trajectory, session.late_sigma_s = flown.load_trajectory(task.trajectory)
+        folder = task.trajectory if task.trajectory.is_dir() else task.trajectory.parent
+        session.own_cloud = task.cloud is not None and task.cloud.absolute().parent == folder.absolute()
     if session.trajectory is None:
         return
     if timed is None:

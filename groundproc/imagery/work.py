@@ -12,6 +12,7 @@ from groundproc.imagery import assembly, flown, gate, hybrid, lasting, located, 
 from groundproc.imagery.assembly import Assembled, Known
 from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.screen import Adjusted, adjust
+from groundproc.imagery.lensdoubt import lens_doubts
 from groundproc.imagery.measurements import Measurements, Tracks, gather, rows_of
 from groundproc.imagery.poses import NO_TIME
 from groundproc.imagery.rig import RigCamera
@@ -122,7 +123,9 @@ def _adjusted(
     block = replace(made.block, measured=made.block.measured.masked(few))
     adjusted = adjust(block, known, matched[few], told)
     mounting, held_out = gate.accepted(adjusted.solved.block, known)
-    block = flown.with_lateness(replace(adjusted.solved.block, mounting=mounting), session.late_sigma_s)
+    block = flown.with_lateness(
+        replace(adjusted.solved.block, mounting=mounting), session.late_sigma_s, session.own_cloud
+    )
     adjusted = _settled(session, block, known, matched[few], told)
     if surface is not None:
         adjusted = _on_surface(adjusted, surface, known, matched[few], told)
@@ -186,7 +189,7 @@ def _finish(
     utc_ns = np.where(stamps == NO_TIME, NO_TIME, stamps + shift)
     told = results.figures(adjusted, session.site, measured.names, session.control) | more
     told |= _origins(session)
-    session.warnings += doubts_of(told, session, measured)
+    session.warnings += doubts_of(told, session, measured) + lens_doubts(adjusted)
     told["left_out"] = session.left_out
     told["warnings"] = session.warnings
     if session.pictures:

@@ -148,7 +148,8 @@ def write_estimate(folder: Path, estimate: Estimate) -> None:
     _write_arrays(folder / EXACT, _exact(trajectory, _digest(folder / TRAJECTORY)))
     time_ns = covariance_times(trajectory)
     covariance = trajectory.covariance_at(time_ns)
-    _write_arrays(folder / COVARIANCE, {"time_ns": time_ns, "covariance": covariance, "states": np.array(STATES)})
+    arrays = {"time_ns": time_ns, "covariance": covariance, "states": np.array(STATES)}
+    _write_arrays(folder / COVARIANCE, arrays if trajectory.datum is None else arrays | {"datum": trajectory.datum})
     _write_text(folder / MOUNT, f"# {estimate.mount_source or 'as given'}\n{estimate.mount.yaml()}")
     write_lasers(folder / LASERS, estimate.corrections, "# in firing order; 0: as the manual has it\n")
     _write_text(folder / TIES, config.dump(_Ties(estimate.ties)))
@@ -236,13 +237,15 @@ def read_knots(folder: Path) -> tuple[Trajectory, bool]:
     _check(path, str(held["interpolation"]) in (SMOOTH, HOLD), f"interpolation {SMOOTH} or {HOLD}")
     frame = LocalFrame(*(float(value) for value in held["frame"]))
     correlation = correlation_of(*read_covariance(folder / COVARIANCE))
+    datum = _read_datum(folder / COVARIANCE)
     changed = _digest(folder / TRAJECTORY) != str(held["csv_sha256"])
     if changed:
         rounded = read_trajectory(folder / TRAJECTORY, frame)
         arrays: dict[str, Any] = {name: getattr(rounded, name) for name in _OF_TRAJECTORY}
-        return Trajectory(frame, **arrays, correlation=correlation), True
+        return Trajectory(frame, **arrays, correlation=correlation, datum=datum), True
     arrays = {name: held[name] for name in _OF_TRAJECTORY}
-    return Trajectory(frame, **arrays, interpolation=str(held["interpolation"]), correlation=correlation), False
+    interpolation = str(held["interpolation"])
+    return Trajectory(frame, **arrays, interpolation=interpolation, correlation=correlation, datum=datum), False
 
 
 def read_covariance(path: Path) -> tuple[npt.NDArray[np.int64], Array]:
@@ -261,6 +264,16 @@ def read_covariance(path: Path) -> tuple[npt.NDArray[np.int64], Array]:
     wanted = (len(time_ns), SIZE, SIZE)
     _check(path, covariance.shape == wanted and covariance.dtype.kind == "f", f"covariance of shape {wanted}")
     return time_ns, covariance.astype(np.float64)
+
+
+def _read_datum(path: Path) -> Array | None:
+    """What all poses share, shape (6, 6); None where the file does not say."""
+    datum = read_arrays(path).get("datum")
+    if datum is None:
+        return None
+    _check(path, datum.shape == (SIZE, SIZE) and datum.dtype.kind == "f", f"datum of shape {(SIZE, SIZE)}")
+    _check(path, bool(np.isfinite(datum).all()), "datum of numbers")
+    return np.asarray(0.5 * (datum + datum.T), np.float64)
 
 
 def _read_report(path: Path) -> _Said:

@@ -66,6 +66,9 @@ class Trajectory:
         "cubic", or "hold": the nearest knot's pose, as the source does on its 10 ms grid.
     correlation : Correlation, optional
         Of the six errors of a pose, at knots of its own; None: they are taken to be independent.
+    datum : ndarray, shape (6, 6), optional
+        Covariance of a shift [m] and a turn about the local origin [rad] that all poses share; it is in that of each pose. None: how
+        the errors of one pose hang together with those of another is not known.
     """
 
     frame: LocalFrame
@@ -79,6 +82,7 @@ class Trajectory:
     covered: npt.NDArray[np.bool_]
     interpolation: str = SMOOTH
     correlation: Correlation | None = None
+    datum: Array | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -182,7 +186,8 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
                 f"{utc_text(int(second.time_ns[0]))}, expected later"
             )
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
-    return replace(parts[0], **arrays, correlation=_correlation_of(parts))
+    datum = parts[0].datum if len(parts) == 1 else None
+    return replace(parts[0], **arrays, correlation=_correlation_of(parts), datum=datum)
 
 
 def _correlation_of(parts: Sequence[Trajectory]) -> Correlation | None:

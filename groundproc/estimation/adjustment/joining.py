@@ -23,7 +23,7 @@ from groundproc.estimation.adjustment.batch import DRAWS, add_world, corrected, 
 from groundproc.estimation.adjustment.noise import noise_of
 from groundproc.estimation.adjustment.patches import Patches, coarse
 from groundproc.estimation.adjustment.poses import pose_errors
-from groundproc.estimation.adjustment.posterior import Posterior, Spread
+from groundproc.estimation.adjustment.posterior import Posterior, Spread, datum_of
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.observations.lidar import DEFLATION
 from groundproc.estimation.observations.observation import Observation, State
@@ -222,7 +222,8 @@ class Joining:
             if not name.startswith("world.")
         }
         told = told_by(self.observations, self.state())
-        return Joined(self.begin, self.path, sigmas[0], sigmas[1], found, self.log, told, correlation)
+        datum = datum_of(spread, unknowns)
+        return Joined(self.begin, self.path, sigmas[0], sigmas[1], found, self.log, told, correlation, datum)
 
 
 @dataclass(slots=True)
@@ -242,6 +243,8 @@ class Joined:
         What the observations say, by their names.
     correlation : ndarray, shape (slices + 1 or more, 6, 6)
         Of the errors of position and attitude at slice boundaries.
+    datum : ndarray, shape (6, 6)
+        Of the shift and the turn about the origin that all of the path shares.
     """
 
     begin: Path
@@ -252,6 +255,7 @@ class Joined:
     log: list[dict[str, float]]
     told: dict[str, Any] = field(default_factory=dict)
     correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
+    datum: Array = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
 
     def applied(self, path: Path) -> Path:
         """The path that was begun with, on its fine grid, as corrected."""

@@ -161,6 +161,19 @@ class Posterior:
         return np.asarray(0.5 * (columns + columns.T))
 
 
+def datum_of(spread: Spread, unknowns: Unknowns) -> Array:
+    """Covariance of the shift and of the turn about the origin that all of a path shares, shape (6, 6).
+
+    It is the anchors' part, which needs no draws; where control holds the whole there is none, and draws tell.
+    """
+    where = np.concatenate(
+        [np.arange(unknowns.names[n].start, unknowns.names[n].stop) for n in ("world.shift", "world.turn")]
+    )
+    if len(spread.columns):
+        return np.asarray(spread.columns[:, where].T @ spread.columns[:, where])
+    return np.asarray(spread.whole[:, where].T @ spread.whole[:, where] / len(spread.whole))
+
+
 def whole_covariance(posterior: Posterior, path: Path) -> Array:
     """Covariance of the turn about the origin and the shift of a path as a whole, shape (6, 6).
 

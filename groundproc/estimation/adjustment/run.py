@@ -135,7 +135,8 @@ class Run:
         grid, knots = np.arange(len(self.path.quat)), np.arange(len(position)) * STEPS
         sigmas = (np.stack([np.interp(grid, knots, axis) for axis in part.T], axis=1) for part in (position, attitude))
         made = of_ins(self.path, self.motion, given.frame, mount, *sigmas)
-        return replace(made, correlation=Correlation(made.time_ns[knots], correlation))
+        datum = self.windows[0].datum if self.joined is None else self.joined.datum
+        return replace(made, correlation=Correlation(made.time_ns[knots], correlation), datum=datum)
 
     def warnings(self) -> list[str]:
         """What the self-check found, a sentence each."""
