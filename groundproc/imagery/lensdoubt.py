@@ -8,6 +8,7 @@ import numpy.typing as npt
 from groundproc.imagery.bundle.screen import Adjusted
 from groundproc.imagery.bundle.solve import image_residuals
 from groundproc.imagery.rig import RigCamera
+from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 
@@ -56,7 +57,7 @@ def worst_ring(one: RigCamera, pixel: Array, residual: Array) -> tuple[float, fl
     outwards = np.einsum("ni,ni->n", residual, arm) / np.maximum(radius, 1.0)
     rings = np.array_split(np.argsort(radius, kind="stable"), RINGS)
     middle = np.array([np.median(outwards[ring]) for ring in rings])
-    usual = np.array([np.median(np.abs(outwards[ring] - at)) for ring, at in zip(rings, middle, strict=True)]) / 0.6745
+    usual = np.array([robust.sigma(outwards[ring], float(at)) for ring, at in zip(rings, middle, strict=True)])
     sigma = _MEDIAN * usual / np.sqrt([len(ring) for ring in rings])
     shown = (np.abs(middle) > CERTAIN * sigma) & (np.abs(middle) > np.maximum(SHARE * np.median(usual), LEAST_PX))
     if shown.sum() < 2:
