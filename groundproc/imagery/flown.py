@@ -32,7 +32,8 @@ LATE_SIGMA_S: Final = 0.01
 """By how much an autopilot's attitudes may be later than places: what filters of gyros delay them."""
 OF_AUTOPILOT: Final = ("filtered", "ins")
 """Methods whose attitudes are the autopilot's; one clock is behind all that others find."""
-LEAST_SHARE: Final = 0.01
+LEAST_SHARE: Final = 1e-3
+"""Of a variance: less is not believed to be left beside the datum, which is as well known as draws tell it."""
 PLAIN_PLACE_M: Final = (0.1, 0.1, 0.15)
 PLAIN_TURN_RAD: Final = float(np.deg2rad(0.3))
 """Of a trajectory that states no sigmas."""
