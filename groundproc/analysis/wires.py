@@ -58,6 +58,7 @@ _LOWEST_M: Final = 0.8
 """Height above ground from which lines are looked for: the foot of a stay."""
 _GROWTH_M: Final = 40.0
 """Growth further away is not told of."""
+_LEVEL: Final = 0.7
 _GUARD_M: Final = 1.5
 """A wire that hangs so much above all others of its span, by itself or with one more, is a guard."""
 
@@ -171,7 +172,8 @@ def _found(task: Task, floor: Floor) -> Made:
         up = above > _LOWEST_M
         found = thin_points(tile.xyz_m[up], tile.core[up])
         lines.append(np.hstack([found.xyz_m, found.direction])[found.core])
-        made.poles += upright(tile.xyz_m, above, tile.core)
+        level = np.abs(found.direction[:, 2]) < _LEVEL
+        made.poles += upright(tile.xyz_m, above, tile.core, found.xyz_m[level])
         strips.append(_low_strips(tile.xyz_m, above, tile.core))
     points = np.concatenate(lines) if lines else np.empty((0, 6))
     _sort_lines(task, floor, points[:, :3], points[:, 3:], made)
@@ -204,7 +206,9 @@ def _sort_lines(task: Task, floor: Floor, xyz_m: Array, direction: Array, made: 
     """Conductors and stays of points on lines."""
     flat = np.abs(direction[:, 2]) < 0.7
     tall = floor.above(xyz_m) > task.least_height_m
-    chains = [xyz_m[flat & tall][each] for each in chained(xyz_m[flat & tall], direction[flat & tall], 6, 5.0)]
+    chains = [
+        xyz_m[flat & tall][each] for each in chained(xyz_m[flat & tall], direction[flat & tall], 6, 5.0, made.poles)
+    ]
     made.wires = conductors(chains, made.poles)
     made.guard = _guards(made.wires)
     steep = np.abs(direction[:, 2]) > 0.4

@@ -64,6 +64,11 @@ class Catenary:
         s = d @ self.along
         return s, d @ np.array([-self.along[1], self.along[0]]), xyz_m[:, 2] - self.height(s)
 
+    def tangent(self, s_m: float) -> Array:
+        """Unit vector along it, shape (3,)."""
+        way = np.append(self.along, np.sinh((s_m - self.middle_m) / self.a_m))
+        return np.asarray(way / np.linalg.norm(way))
+
     def places(self, step_m: float) -> Array:
         """Vertices from end to end at most a step apart in plan, shape (n, 3)."""
         s = np.linspace(self.start_m, self.end_m, max(int(np.ceil(self.length_m / step_m)), 1) + 1)

@@ -1,5 +1,6 @@
 """Points of thin lines joined along them."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -7,18 +8,24 @@ import numpy.typing as npt
 import scipy.sparse
 from scipy.spatial import cKDTree
 
+from groundproc.analysis.corridor.poles import ARM_M, Pole
+
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 _GAP_M: Final = 5.0
-_OFF_M: Final = 0.25
+_OFF_M: Final = 0.08
+_LEAN: Final = 0.035
+"""How far points are off each other's lines: noise, and what the direction errs by, along the way between them."""
+_ARM_SHARE: Final = 0.25
+"""Half a crossarm of a mast, in its height."""
 _TURN: Final = float(np.cos(np.deg2rad(9.0)))
 
 
-def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float) -> list[Ints]:
+def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float, poles: Sequence[Pole] = ()) -> list[Ints]:
     """Numbers of the points of each chain.
 
-    Two points are of one chain that lie near each other on each other's lines.
+    Two points are of one chain that lie near each other on each other's lines, with no pole between them.
 
     Parameters
     ----------
@@ -27,6 +34,8 @@ def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float) -> l
     fewest : int
     shortest_m : float
         Points and length that a chain has at least.
+    poles : sequence of Pole
+        Where wires end. One that is none, such as a stem, does no harm: pieces of one curve are joined again.
     """
     if len(xyz_m) < fewest:
         return []
@@ -37,8 +46,8 @@ def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float) -> l
     for each in (a, b):
         along = np.sum(between * direction[each], axis=1)
         off = np.sum(between**2, axis=1) - along**2
-        joined &= off < _OFF_M**2
-    a, b = a[joined], b[joined]
+        joined &= off < (_OFF_M + _LEAN * np.abs(along)) ** 2
+    a, b = _unsupported(xyz_m, a[joined], b[joined], poles)
     graph = scipy.sparse.coo_array((np.ones(len(a), np.int8), (a, b)), shape=(len(xyz_m),) * 2)
     count, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(number, kind="stable")
@@ -46,3 +55,23 @@ def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float) -> l
     return [
         each for each in chains if len(each) >= fewest and np.linalg.norm(np.ptp(xyz_m[each], axis=0)) >= shortest_m
     ]
+
+
+def _unsupported(xyz_m: Array, a: Ints, b: Ints, poles: Sequence[Pole]) -> tuple[Ints, Ints]:
+    """Pairs of points without those that a pole stands between."""
+    tree = cKDTree(xyz_m[:, :2])
+    for pole in poles:
+        place = np.array([pole.x, pole.y])
+        reach = max(ARM_M, _ARM_SHARE * pole.height_m)
+        near = np.zeros(len(xyz_m), np.bool_)
+        near[tree.query_ball_point(place, reach + _GAP_M)] = True
+        some = np.flatnonzero(near[a] & near[b])
+        way = xyz_m[b[some], :2] - xyz_m[a[some], :2]
+        length = np.maximum(np.hypot(*way.T), 1e-9)
+        way /= length[:, None]
+        to = place - xyz_m[a[some], :2]
+        along, off = np.sum(to * way, axis=1), np.abs(to[:, 0] * way[:, 1] - to[:, 1] * way[:, 0])
+        keep = np.ones(len(a), np.bool_)
+        keep[some[(along > 0.0) & (along < length) & (off < reach)]] = False
+        a, b = a[keep], b[keep]
+    return a, b

@@ -12,6 +12,8 @@ Array = npt.NDArray[np.float64]
 MAST_M: Final = 15.0
 """Higher poles are called masts."""
 HALO_M: Final = 2.0
+ARM_M: Final = 2.6
+"""Half a crossarm, and more."""
 _LEAST_M: Final = 3.0
 _CELL_M: Final = 0.5
 _BIN_M: Final = 0.5
@@ -19,12 +21,14 @@ _FEWEST_BINS: Final = 4
 _FILLED: Final = 0.65
 """Share of its height that has points."""
 _CORE_M: Final = 0.35
-_RING_M: Final = (0.6, 1.6)
+_SIZES_M: Final = ((_CORE_M, 0.6, 1.6), (0.7, 0.95, 1.95))
+"""Radius that holds a pole, or a mast, and a ring around it."""
 _RING: Final = 0.35
 """Points around a pole, as a share of its own at the same heights: a crown has many times as many as its stem."""
 _CROWN: Final = 2.5
 """The same near its top, where crossarms and wires are."""
 _FOOT_M: Final = 0.5
+_ON_LINE_M: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +56,9 @@ class Pole:
         return "mast" if self.height_m >= MAST_M else "pole"
 
 
-def upright(xyz_m: Array, above_m: npt.NDArray[np.float32], core: npt.NDArray[np.bool_]) -> list[Pole]:
+def upright(
+    xyz_m: Array, above_m: npt.NDArray[np.float32], core: npt.NDArray[np.bool_], lines_m: Array | None = None
+) -> list[Pole]:
     """Poles among the points of a tile.
 
     Parameters
@@ -63,6 +69,8 @@ def upright(xyz_m: Array, above_m: npt.NDArray[np.float32], core: npt.NDArray[np
         Their heights above it.
     core : ndarray of bool, shape (n,)
         Points of the tile proper: a pole is the tile's that the nearest to its axis is in.
+    lines_m : ndarray, shape (m, 3), optional
+        Points on level lines: wires that end at a pole are no crown.
     """
     some = above_m > _FOOT_M
     xyz_m, above_m, core = xyz_m[some], above_m[some], core[some]
@@ -70,11 +78,17 @@ def upright(xyz_m: Array, above_m: npt.NDArray[np.float32], core: npt.NDArray[np
         return []
     tree = cKDTree(xyz_m[:, :2])
     found: list[Pole] = []
+    lines = cKDTree(lines_m) if lines_m is not None and len(lines_m) else None
     for middle in _columns(xyz_m, above_m):
         if any(np.hypot(middle[0] - p.x, middle[1] - p.y) < 1.0 for p in found):
             continue
-        near = np.array(tree.query_ball_point(middle, _RING_M[1]))
-        pole = _pole(middle, xyz_m[near], above_m[near])
+        near = np.array(tree.query_ball_point(middle, _SIZES_M[-1][-1]))
+        if lines is not None:
+            away = np.hypot(*(xyz_m[near, :2] - middle).T) > _CORE_M
+            away[away] = lines.query(xyz_m[near[away]], distance_upper_bound=_ON_LINE_M)[0] < _ON_LINE_M
+            near = near[~away]
+        sizes = (_pole(middle, xyz_m[near], above_m[near], size) for size in _SIZES_M)
+        pole = next((each for each in sizes if each is not None), None)
         if pole is None or any(np.hypot(pole.x - p.x, pole.y - p.y) < 1.0 for p in found):
             continue
         if core[tree.query([pole.x, pole.y])[1]]:
@@ -100,26 +114,35 @@ def _columns(xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Array:
     return middles[np.argsort(-counts[counts >= _FEWEST_BINS], kind="stable")]
 
 
-def _pole(middle: Array, xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Pole | None:
-    """The pole near a place, if there is one."""
+def _pole(
+    middle: Array, xyz_m: Array, above_m: npt.NDArray[np.float32], size_m: tuple[float, float, float]
+) -> Pole | None:
+    """The pole of a size near a place, if there is one."""
+    core_m, inner_m, outer_m = size_m
     for _ in range(3):
-        inside = np.hypot(*(xyz_m[:, :2] - middle).T) < _CORE_M
+        inside = np.hypot(*(xyz_m[:, :2] - middle).T) < core_m
         if inside.sum() < _FEWEST_BINS:
             return None
-        middle = np.median(xyz_m[inside, :2], axis=0)
+        middle = _axis(xyz_m[inside], above_m[inside])
     away = np.hypot(*(xyz_m[:, :2] - middle).T)
-    inside = away < _CORE_M
+    inside = away < core_m
     levels = np.unique(np.floor(above_m[inside] / _BIN_M).astype(np.int64))
     top = float(above_m[inside].max())
-    if top < _LEAST_M:
+    if top < (_LEAST_M if core_m == _CORE_M else MAST_M):
         return None
     filled = len(levels) / (np.floor(top / _BIN_M) - np.floor(_FOOT_M / _BIN_M) + 1.0)
     # crossarms and wires are near its top, bushes near its foot
     body, head = (above_m > 1.5) & (above_m < 0.75 * top), above_m >= 0.75 * top
-    ring = (away > _RING_M[0]) & (away < _RING_M[1])
+    ring = (away > inner_m) & (away < outer_m)
     share = int((body & ring).sum()) / max(int((body & inside).sum()), 1)
     crown = int((head & ring).sum()) / max(int((head & inside).sum()), 1)
     if filled < _FILLED or share > _RING or crown > _CROWN:
         return None
     foot = float(np.median(xyz_m[inside, 2] - above_m[inside]))
     return Pole(float(middle[0]), float(middle[1]), foot, top, float(filled * (1.0 - share)))
+
+
+def _axis(xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Array:
+    """Middle of points by the middles of their levels: where wires are fastened, many points are beside it."""
+    level = np.floor(above_m / _BIN_M).astype(np.int64)
+    return np.median([np.median(xyz_m[level == each, :2], axis=0) for each in np.unique(level)], axis=0)

@@ -1,13 +1,13 @@
 """Conductors from attachment to attachment, of chains of points."""
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from groundproc.analysis.corridor.catenary import Catenary, fitted
-from groundproc.analysis.corridor.poles import Pole
+from groundproc.analysis.corridor.poles import ARM_M, Pole
 
 Array = npt.NDArray[np.float64]
 
@@ -21,16 +21,36 @@ _ROUGH_M: Final = 0.08
 _BETTER: Final = 3.0
 """... and is, if two curves leave so much less of its squares."""
 _TRIALS: Final = 40
+_KINK_M: Final = 0.5
+"""How well the place of a kink is looked for."""
 _DRAWS: Final = 300
 _DRAW_M: Final = 30.0
-_ON_M: Final = 0.25
+_ON_M: Final = 0.12
+_PROMISING: Final = 0.5
+_GROWTHS: Final = 6
+_SHARP: Final = 0.14
+"""Angle [rad] at which points of 3 cm tell the place of a bend better than a pole does."""
+_BEYOND_M: Final = 3.0
+_SETTLING: Final = 4
+_OWN_M: Final = 0.25
+"""Points farther from all curves are of none."""
+_NEXT_M: Final = 0.5
+"""A curve takes points so far beyond its ends: further on it meets others of its bundle."""
+_SAME_M: Final = 0.1
+"""Curves nearer to each other are one."""
 _WORST_M: Final = 0.15
 _JOIN_M: Final = 40.0
 """Gap that a conductor may have."""
 _COVERED: Final = 0.5
 _BIN_M: Final = 5.0
-_ARM_M: Final = 2.6
-"""Half a crossarm, and more."""
+
+
+class _Meeting(NamedTuple):
+    """Where the curve of the next span meets that of a wire, how far that is beyond the ends of both, and the angle between them."""
+
+    s_m: float
+    beyond_m: float
+    turn: float
 
 
 def conductors(chains: Sequence[Array], poles: Sequence[Pole]) -> list[Catenary]:
@@ -42,7 +62,7 @@ def conductors(chains: Sequence[Array], poles: Sequence[Pole]) -> list[Catenary]
     poles : sequence of Pole
     """
     pieces = [part for chain in chains for part in cut(chain)]
-    whole = joined(pieces)
+    whole = settled(joined(pieces))
     wires = [wire for wire, points in zip(map(fitted, whole), whole, strict=True) if _sound(wire, points)]
     return [attached(each, wires, poles) for each in wires]
 
@@ -68,20 +88,25 @@ def cut(points_m: Array, depth: int = 0) -> list[Array]:
 
 def _kink(points_m: Array, s: Array) -> tuple[int, float]:
     """Where two curves fit points in order along them best, as the number of the first of the second, and what squares are left then."""
-    best, place = np.inf, 0
-    for at in np.linspace(s[0] + _LEAST_PIECE_M, s[-1] - _LEAST_PIECE_M, _TRIALS):
-        k = int(np.searchsorted(s, at))
-        if _LEAST_PIECE <= k <= len(s) - _LEAST_PIECE:
-            cost = _misfit(points_m[:k]) + _misfit(points_m[k:])
-            if cost < best:
-                best, place = cost, k
-    return place, best
+    best, place, where = np.inf, 0, 0.5 * (s[0] + s[-1])
+    low, high = s[0] + _LEAST_PIECE_M, s[-1] - _LEAST_PIECE_M
+    while True:
+        for at in np.linspace(low, high, _TRIALS):
+            k = int(np.searchsorted(s, at))
+            if _LEAST_PIECE <= k <= len(s) - _LEAST_PIECE:
+                cost = _misfit(points_m[:k]) + _misfit(points_m[k:])
+                if cost < best:
+                    best, place, where = cost, k, at
+        step = (high - low) / (_TRIALS - 1)
+        if step < _KINK_M:
+            return place, best
+        low, high = max(where - step, s[0] + _LEAST_PIECE_M), min(where + step, s[-1] - _LEAST_PIECE_M)
 
 
 def _one_of(points_m: Array) -> npt.NDArray[np.bool_]:
     """Points of the one curve that most of a bundle are on (RANSAC, always by the same chances)."""
     rng = np.random.default_rng(len(points_m))
-    best = np.zeros(len(points_m), np.bool_)
+    best = np.zeros(len(points_m))
     for _ in range(_DRAWS):
         start = int(rng.integers(len(points_m)))
         near = np.flatnonzero(np.hypot(*(points_m[:, :2] - points_m[start, :2]).T) < _DRAW_M)
@@ -95,12 +120,37 @@ def _one_of(points_m: Array) -> npt.NDArray[np.bool_]:
         if np.diff(np.sort(u)).min() < 1.0:
             continue
         bend = np.polyfit(u, three[:, 2], 2)
-        v = points_m[:, :2] - three[0, :2]
-        off, up = v @ np.array([-d[1], d[0]]), points_m[:, 2] - np.polyval(bend, v @ d)
-        on = (np.abs(off) < _ON_M) & (np.abs(up) < _ON_M)
-        if bend[0] > -1e-3 and on.sum() > best.sum():
-            best = on
-    return best
+        if bend[0] <= -1e-3:
+            continue
+        on = _nearness(points_m, three[0, :2], d, bend)
+        if on.sum() > _PROMISING * best.sum():
+            on = _grown(points_m, on)
+            if on.sum() > best.sum():
+                best = on
+    return np.asarray(best > 0.0)
+
+
+def _nearness(points_m: Array, origin: Array, way: Array, bend: Array) -> Array:
+    """1 on a parabola above a line in plan, falling to 0 where a point is of another curve: one that drifts from wire to wire has less."""
+    v = points_m[:, :2] - origin
+    off, up = v @ np.array([-way[1], way[0]]), points_m[:, 2] - np.polyval(bend, v @ way)
+    return np.asarray(np.maximum(1.0 - (off**2 + up**2) / _ON_M**2, 0.0))
+
+
+def _grown(points_m: Array, on: Array) -> Array:
+    """What lies on the curve through some points, again and again: three of them do not tell it far from themselves."""
+    for _ in range(_GROWTHS):
+        some = points_m[on > 0.0]
+        if len(some) < _LEAST_PIECE:
+            return on
+        origin = some.mean(axis=0)[:2]
+        d = some[:, :2] - origin
+        way = np.linalg.eigh(d.T @ d)[1][:, 1]
+        more = _nearness(points_m, origin, way, np.polyfit(d @ way, some[:, 2], 2))
+        if more.sum() <= on.sum():
+            break
+        on = more
+    return on
 
 
 def _misfit(points_m: Array) -> float:
@@ -146,6 +196,34 @@ def _together(points: Array, curve: Catenary, others: Array, other: Catenary) ->
     return both if both.rms_m < 1.3 * max(curve.rms_m, other.rms_m, 0.04) else None
 
 
+def settled(pieces: Sequence[Array]) -> list[Array]:
+    """Each point with the curve that it is nearest to: where pieces were cut, and where they hang beside each other, some are with another.
+
+    Curves that lie on each other become one.
+    """
+    whole = sorted((each for each in pieces if len(each) >= _LEAST_PIECE), key=len, reverse=True)
+    for _ in range(_SETTLING):
+        curves: list[Catenary] = []
+        for curve, points in zip(map(fitted, whole), whole, strict=True):
+            if not any(np.median(_apart(each, points)) < _SAME_M for each in curves):
+                curves.append(curve)
+        if not curves:
+            return []
+        pool = np.concatenate(whole)
+        apart = np.array([_apart(each, pool) for each in curves])
+        nearest = np.where(apart.min(axis=0) < _OWN_M, apart.argmin(axis=0), -1)
+        whole = [pool[nearest == number] for number in range(len(curves))]
+        whole = sorted((each for each in whole if len(each) >= _LEAST_PIECE), key=len, reverse=True)
+    return whole
+
+
+def _apart(wire: Catenary, points_m: Array) -> Array:
+    """Distances of points from a curve, across it; beyond its ends infinite."""
+    s, off, up = wire.local(points_m)
+    reach = _NEXT_M + 2.0 * wire.length_m / wire.points
+    return np.where((s > wire.start_m - reach) & (s < wire.end_m + reach), np.hypot(off, up), np.inf)
+
+
 def _sound(wire: Catenary, points_m: Array) -> bool:
     """Long, thin and without a gap over most of its length."""
     if len(points_m) < FEWEST or wire.length_m < SHORTEST_M or wire.rms_m > _WORST_M:
@@ -161,9 +239,10 @@ def attached(wire: Catenary, wires: Sequence[Catenary], poles: Sequence[Pole]) -
     reach = 3.0 + 0.12 * wire.length_m
     ends = []
     for end, sign in ((wire.start_m, -1.0), (wire.end_m, 1.0)):
-        found = _at_pole(wire, end, reach, poles)
-        if found is None:
-            found = _at_wire(wire, end, sign, reach, wires)
+        met, pole = _at_wire(wire, end, sign, reach, wires), _at_pole(wire, end, reach, poles)
+        # at a bend the arms lean, and wires do not end where the pole is
+        sharp = met is not None and met.turn > _SHARP and met.beyond_m < _BEYOND_M
+        found = met.s_m if met is not None and (sharp or pole is None) else pole
         ends.append(end if found is None else found)
     return wire.between(min(ends[0], wire.middle_of - 1.0), max(ends[1], wire.middle_of + 1.0))
 
@@ -174,13 +253,15 @@ def _at_pole(wire: Catenary, end: float, reach: float, poles: Sequence[Pole]) ->
         place = np.array([[pole.x, pole.y, pole.foot_m]])
         s, off, up = wire.local(place)
         high = -float(up[0])
-        if abs(off[0]) <= _ARM_M and abs(s[0] - end) < best and high < pole.height_m + 2.5:
+        if abs(off[0]) <= ARM_M and abs(s[0] - end) < best and high < pole.height_m + 2.5:
             best, found = abs(float(s[0]) - end), float(s[0])
     return found
 
 
-def _at_wire(wire: Catenary, end: float, sign: float, reach: float, wires: Sequence[Catenary]) -> float | None:
+def _at_wire(wire: Catenary, end: float, sign: float, reach: float, wires: Sequence[Catenary]) -> _Meeting | None:
+    """Where another curve goes on: that whose own end is nearest, for those beside it in a bundle meet it too, further on."""
     here = np.append(wire.origin_m + end * wire.along, wire.height(np.array([end]))[0])
+    found: _Meeting | None = None
     for other in wires:
         if other is wire:
             continue
@@ -189,8 +270,12 @@ def _at_wire(wire: Catenary, end: float, sign: float, reach: float, wires: Seque
             continue
         s = end + sign * np.linspace(-0.1 * reach, reach, 201)
         places = np.column_stack([wire.origin_m + s[:, None] * wire.along, wire.height(s)])
-        _, off, up = other.local(places)
+        along, off, up = other.local(places)
         apart = np.hypot(off, up)
-        if apart.min() < 0.3:
-            return float(s[np.argmin(apart)])
-    return None
+        nearest = int(np.argmin(apart))
+        beyond = min(abs(along[nearest] - other.start_m), abs(along[nearest] - other.end_m))
+        cost = abs(s[nearest] - end) + float(beyond)
+        if apart[nearest] < 0.3 and (found is None or cost < found.beyond_m):
+            turn = np.arccos(min(abs(float(wire.tangent(s[nearest]) @ other.tangent(along[nearest]))), 1.0))
+            found = _Meeting(float(s[nearest]), cost, float(turn))
+    return found

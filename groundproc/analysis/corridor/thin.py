@@ -14,11 +14,15 @@ Array = npt.NDArray[np.float64]
 RADIUS_M: Final = 4.0
 """How far along a line is looked: a wire has a hit or two of each laser that passes over it."""
 _NEIGHBOURS: Final = 64
+_MORE: Final = 256
+_CROWDED_M: Final = 2.5
+"""Where all neighbours are nearer, as amid the wires of one pole, more are looked at."""
+_PIECE: Final = 25_000
 _DIRECTIONS: Final = 20
-_TUBE_M: Final = 0.15
-"""Points so far from a line are on it: noise, and what strips disagree in."""
-_SHELL_M: Final = 0.35
-"""Points up to here are beside it. Conductors of one line hang further apart."""
+_TUBES_M: Final = ((0.15, 0.35, 4.0), (0.09, 0.2, 6.0))
+"""Points nearer to a line than the first are on it: noise, and what strips disagree in. Points up to the second are beside it. The third is
+how many are on it at least: in a crown some lie on a narrow line by chance. The wide tube bears strips that disagree, and conductors hang
+further apart than that; the narrow one tells the four of a rack or a bundle, 25 to 40 cm apart."""
 _FEWEST: Final = 4
 _SPAN_M: Final = 2.0
 _VOXEL_M: Final = 0.2
@@ -57,23 +61,27 @@ def thin_points(xyz_m: Array, core: npt.NDArray[np.bool_]) -> Thin:
     first = np.full(count, -1, np.int64)
     first[voxel[::-1]] = np.arange(len(voxel))[::-1]
     places, core = xyz_m[first] - origin, core[first]
-    tree = cKDTree(places)
+    tree: Any = cKDTree(places)
     directions = np.zeros_like(places)
-    for start in range(0, len(places), 100_000):
-        some = slice(start, start + 100_000)
-        _, near = tree.query(places[some], k=min(_NEIGHBOURS, len(places)), distance_upper_bound=RADIUS_M)
-        _directions(places, near, start, directions)
+    tubes = np.array(_TUBES_M)
+    for start in range(0, len(places), _PIECE):
+        number = np.arange(start, min(start + _PIECE, len(places)))
+        away, near = tree.query(places[number], k=min(_NEIGHBOURS, len(places)), distance_upper_bound=RADIUS_M)
+        _directions(places, near, number, tubes, directions)
+        crowded = number[(away[:, -1] < _CROWDED_M) & (len(places) > _NEIGHBOURS)]
+        _, near = tree.query(places[crowded], k=min(_MORE, len(places)), distance_upper_bound=RADIUS_M)
+        _directions(places, near, crowded, tubes, directions)
     on = np.abs(directions).sum(axis=1) > 0.0
     return Thin(places[on] + origin, directions[on], core[on])
 
 
 @njit(cache=True, nogil=True)
-def _directions(places: Any, near: Any, start: int, out: Any) -> None:
-    """The line through each point along which most neighbours lie, if it is a thin one; else zeros."""
+def _directions(places: Any, near: Any, number: Any, tubes: Any, out: Any) -> None:
+    """The line through each point along which most neighbours lie, if it is a thin one; else it stays what it was."""
     n = len(places)
     d = np.empty((near.shape[1], 3))
     for row in range(len(near)):
-        i, m = start + row, 0
+        i, m = number[row], 0
         for k in range(near.shape[1]):
             j = near[row, k]
             if j >= n:
@@ -88,23 +96,25 @@ def _directions(places: Any, near: Any, start: int, out: Any) -> None:
             length = np.sqrt(d[k, 0] ** 2 + d[k, 1] ** 2 + d[k, 2] ** 2)
             if length < 0.5 * _SPAN_M:
                 break
-            score = _score(d[:m], d[k, 0] / length, d[k, 1] / length, d[k, 2] / length)
-            if score > best:
-                best = score
-                out[i] = d[k] / length
+            for tube in range(len(tubes)):
+                score = _score(d[:m], d[k] / length, tubes[tube])
+                if score > best:
+                    best = score
+                    out[i] = d[k] / length
 
 
 @njit(cache=True, nogil=True)
-def _score(d: Any, x: float, y: float, z: float) -> float:
+def _score(d: Any, way: Any, tube: Any) -> float:
     """Points on a line less those beside it; 0 where it is no thin one."""
     inside, beside, low, high = 0, 0, 0.0, 0.0
+    x, y, z, on, by = way[0], way[1], way[2], tube[0] ** 2, tube[1] ** 2
     for j in range(len(d)):
         along = d[j, 0] * x + d[j, 1] * y + d[j, 2] * z
         off = d[j, 0] ** 2 + d[j, 1] ** 2 + d[j, 2] ** 2 - along * along
-        if off < _TUBE_M * _TUBE_M:
+        if off < on:
             inside += 1
             low, high = min(low, along), max(high, along)
-        elif off < _SHELL_M * _SHELL_M:
+        elif off < by:
             beside += 1
     score = inside - 1.5 * beside
-    return score if inside >= _FEWEST and high - low >= _SPAN_M and score > 0.4 * inside else 0.0
+    return score if inside >= tube[2] and high - low >= _SPAN_M and score > 0.4 * inside else 0.0
