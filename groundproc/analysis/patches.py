@@ -24,6 +24,8 @@ _ROUNDS: Final = 3
 _LEAST_FILLED: Final = 0.6
 _LEAST_AROUND: Final = 0.4
 """Shares of a patch, and of the square around it, that have to be measured: on the edge of a cloud that is less than half."""
+_TAIL: Final = 1.645
+"""Sigmas that a tenth of a bell lies beyond."""
 _BLOCKS: Final = 8
 """Scatter is told in squares of so many patches, three by three of them."""
 _LEAST_HEIGHT: Final = 3.0
@@ -187,11 +189,19 @@ def _scatter(mean: Array, size: int) -> Array:
     padded[: mean.shape[0], : mean.shape[1]] = np.abs(mean)
     parts = padded.reshape(rows, block, columns, block).swapaxes(1, 2).reshape(rows, columns, -1)
     enough = np.isfinite(parts).mean(axis=2) > 0.1
-    all_of_it = _robust(mean[np.isfinite(mean)])
-    sheet = np.full((rows, columns), all_of_it)
-    sheet[enough] = MAD_TO_SIGMA * np.nanmedian(parts[enough], axis=1)
+    known = np.isfinite(mean)
+    if not known.any():
+        return np.zeros(mean.shape)
+    sheet = np.full((rows, columns), _tailed(np.abs(mean[known])[None])[0])
+    sheet[enough] = _tailed(parts[enough])
     sheet = median_filter(sheet, 3, mode="nearest")
     return np.repeat(np.repeat(sheet, block, 0), block, 1)[: mean.shape[0], : mean.shape[1]]
+
+
+def _tailed(absolute: Array) -> Array:
+    """Sigma of rows of absolute values: by their middle, or by their tenth part from the top where that is heavier than a bell's."""
+    middle, tail = np.nanquantile(absolute, (0.5, 0.9), axis=1)
+    return np.asarray(np.maximum(MAD_TO_SIGMA * middle, tail / _TAIL))
 
 
 def _around(mean: Array, row: int, column: int, size: int) -> Flags:

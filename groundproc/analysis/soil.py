@@ -13,14 +13,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
+from scipy.ndimage import distance_transform_edt
+from scipy.special import erfc
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis.epochs import laid
 from groundproc.analysis.patches import Field, Patch, patches
 from groundproc.analysis.terrain.building import outlines
 from groundproc.analysis.terrain.floor import Floor
+from groundproc.analysis.terrain.surfaces import Sheet
 from groundproc.cloud import reader
-from groundproc.cloud.classes import GROUND, NO_SURFACE, PANE
+from groundproc.cloud.classes import GROUND, NO_SURFACE, PANE, UNCLASSIFIED
 from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tile, Tiles, side_for
 from groundproc.files import written_aside
@@ -41,6 +44,14 @@ _CELLS: Final = (3.0, 10.0)
 """Cells in a patch's side, at least and at most."""
 _FEWEST: Final = 10.0
 """Points of ground on a patch, below which heights are not known well enough."""
+_STANDING_M: Final = 3.0
+"""What stands lower than this above the ground, and is none: walls, shrubs, cars, branches. Its foot passes for ground ..."""
+_BESIDE_M: Final = 0.5
+"""... up to here."""
+_TRIES: Final = 4.0
+"""Places that are looked at on the area of a patch and differ from each other."""
+_BY_CHANCE: Final = 1.0
+"""Claims that the whole area may have by chance: the larger it is, the more unusual each has to be."""
 _STRENGTHS: Final = ("reflectance", "intensity")
 
 
@@ -101,6 +112,7 @@ class Made:
     cell_m: float = 0.0
     registration_sigma_m: float | None = None
     ground_points: int = 0
+    looked_m2: float = 0.0
     places: list[Place] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -112,7 +124,8 @@ class Made:
             "raised_m3": sum(each.volume_m3 for each in raised),
             "sunk_m3": -sum(each.volume_m3 for each in self.places if each.patch.height_m <= 0),
             "strength": self.strength, "ground_points": self.ground_points, "ground_points_per_m2": self.density_m2,
-            "cell_m": self.cell_m, "registration_sigma_m": self.registration_sigma_m, "warnings": self.warnings,
+            "cell_m": self.cell_m, "looked_m2": self.looked_m2,
+            "registration_sigma_m": self.registration_sigma_m, "warnings": self.warnings,
         }  # fmt: skip
 
 
@@ -132,15 +145,17 @@ def work(task: Task, progress: Progress) -> Made:
     made = Made(strength, warnings=unstated(*clouds))
     with written_aside(task.output) as aside:
         floor = Floor(clouds[0], task.output.parent, progress)
-        tiles = _ground(task, clouds, floor, strength, made)
+        tiles, standing = _ground(task, clouds, floor, strength, made)
         found: list[Place] = []
         seen = False
         for tile in tiles:
-            grid, cells = _field(tile, floor, made.cell_m, len(clouds))
+            grid, cells = _field(tile, floor, standing, made.cell_m, len(clouds))
             seen |= bool(np.isfinite(cells.strength).any())
+            made.looked_m2 += float(np.isfinite(cells.height_m).sum() * made.cell_m**2 * tile.core.mean())
             found += _of_tile(tile, grid, cells, floor, task)
             progress(int(tile.core.sum()))
-        made.places = _once(found, task.size_m)
+        tries = _TRIES * made.looked_m2 / task.size_m**2
+        made.places = [each for each in _once(found, task.size_m) if tries * _chance(each.patch, seen) <= _BY_CHANCE]
         if not seen:
             made.strength = None
             made.warnings.append(
@@ -150,8 +165,15 @@ def work(task: Task, progress: Progress) -> Made:
     return made
 
 
-def _ground(task: Task, clouds: list[reader.Cloud], floor: Floor, strength: str | None, made: Made) -> Tiles:
-    """Points of ground in squares; sizes of cells go by how many there are."""
+def _chance(patch: Patch, lit: bool) -> float:
+    """How often even ground is as unusual at one place: of two strengths together, or of height alone."""
+    return float(np.exp(-0.5 * patch.score**2) if lit else erfc(patch.score / np.sqrt(2.0)))
+
+
+def _ground(
+    task: Task, clouds: list[reader.Cloud], floor: Floor, strength: str | None, made: Made
+) -> tuple[Tiles, Sheet]:
+    """Points of ground in squares, and where things stand; sizes of cells go by how many there are."""
     grid = floor.grid
     halo = _HALO * task.size_m
     side = side_for(
@@ -159,8 +181,10 @@ def _ground(task: Task, clouds: list[reader.Cloud], floor: Floor, strength: str 
     )
     tiles = Tiles(task.output.parent, {"epoch": "u1", "strength": "f4"}, side, halo)
     counts, squares = np.zeros(len(clouds)), np.empty(0, np.int64)
+    standing = Sheet(floor.grid, task.output.parent, np.uint8)
     for epoch, xyz, none, values in _pieces(task, clouds, floor, strength, made):
-        _, kind = floor.heights(xyz, none)
+        above, kind = floor.heights(xyz, none)
+        _mark(standing, xyz[(kind == UNCLASSIFIED) & ~none & (above < _STANDING_M)])
         bare = kind == GROUND
         tiles.add(xyz[bare], {"epoch": np.full(int(bare.sum()), epoch, np.uint8), "strength": values[bare]})
         counts[epoch] += bare.sum()
@@ -180,7 +204,34 @@ def _ground(task: Task, clouds: list[reader.Cloud], floor: Floor, strength: str 
             f"{task.cloud}: {made.density_m2:.0f} points of ground on a square metre, fewer than {_FEWEST:g} on a patch of "
             f"{task.size_m:g} m; larger ones are found, see --size"
         )
-    return tiles
+    return tiles, standing
+
+
+def _mark(standing: Sheet, xyz: Array) -> None:
+    """Note the cells that points of standing things lie in."""
+    grid = standing.grid
+    column = np.floor((xyz[:, 0] - grid.west_m) / grid.cell_m).astype(np.int64)
+    down = np.floor((grid.north_m - xyz[:, 1]) / grid.cell_m).astype(np.int64)
+    inside = (column >= 0) & (column < grid.columns) & (down >= 0) & (down < grid.rows)
+    standing.values[down[inside], column[inside]] = 1
+
+
+def _open(standing: Sheet, xy: Array, reach_m: float) -> npt.NDArray[np.bool_]:
+    """Places that nothing stands within a reach of, shape (n,)."""
+    grid = standing.grid
+    column, down = (xy[:, 0] - grid.west_m) / grid.cell_m, (grid.north_m - xy[:, 1]) / grid.cell_m
+    out = np.ones(len(xy), np.bool_)
+    low, high = np.floor([down.min(), column.min()]), np.ceil([down.max(), column.max()])
+    pad = int(np.ceil(reach_m / grid.cell_m)) + 1
+    top, left = (max(int(each) - pad, 0) for each in low)
+    part = np.asarray(standing.values[top : int(high[0]) + pad, left : int(high[1]) + pad]) > 0
+    if not part.any():
+        return out
+    # from the middle of a cell with a thing in it: half a cell more is certain to be of it
+    away = distance_transform_edt(~part) * grid.cell_m
+    i = (np.floor(down).astype(np.int64) - top).clip(0, part.shape[0] - 1)
+    j = (np.floor(column).astype(np.int64) - left).clip(0, part.shape[1] - 1)
+    return np.asarray(away[i, j] > reach_m)
 
 
 def _pieces(
@@ -211,7 +262,7 @@ def _strength(chunk: reader.Chunk, name: str | None) -> npt.NDArray[np.float32]:
     return np.asarray(chunk.points[name]).astype(np.float32)
 
 
-def _field(tile: Tile, floor: Floor, cell_m: float, epochs: int) -> tuple[Grid, Field]:
+def _field(tile: Tile, floor: Floor, standing: Sheet, cell_m: float, epochs: int) -> tuple[Grid, Field]:
     """Cells of a square and around it: of two epochs how much they changed."""
     cell = np.floor(tile.xyz_m[:, :2] / cell_m).astype(np.int64)
     low = cell.min(axis=0)
@@ -220,12 +271,14 @@ def _field(tile: Tile, floor: Floor, cell_m: float, epochs: int) -> tuple[Grid, 
     key = (cell[:, 1] - low[1]) * columns + cell[:, 0] - low[0]
     # above a smooth surface, which is added again in the middle: a slope within a cell does no harm
     over = tile.xyz_m[:, 2] - bilinear(floor.base.values, floor.grid, tile.xyz_m)
-    level = bilinear(floor.base.values, floor.grid, _middles(grid)) if epochs == 1 else 0.0
+    middles = _middles(grid)
+    level = bilinear(floor.base.values, floor.grid, middles) if epochs == 1 else 0.0
     parts = []
     for epoch in range(epochs):
         some = tile.columns["epoch"] == epoch
         parts.append(_cells(key[some], over[some], tile.columns["strength"][some], rows * columns))
     height = parts[-1][0] - (parts[0][0] if epochs == 2 else 0.0) + level
+    height = np.where(_open(standing, middles, _BESIDE_M), height, np.nan)
     variance = sum(each[1] for each in parts)
     strength = parts[-1][2] - (parts[0][2] if epochs == 2 else 0.0)
     shape = rows, columns

@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from groundproc.cli import main
-from simulator import epochs
+from simulator import epochs, outdoors
 from tests.groundproc.analysis.test_ground_command import ORIGIN, write_cloud
 
 SIDE_M, DEEP_M, DARKER = 24.0, 0.03, 0.75
@@ -111,3 +111,12 @@ def test_what_cannot_be_is_one_sentence(
     assert said in err
     assert "\n" not in err
     assert not (tmp_path / "o.geojson").exists()
+
+
+def test_on_a_village_where_nobody_dug_claims_are_rare(tmp_path: Path) -> None:
+    side_m = 60.0
+    place = outdoors.village(1, side_m, 100.0, 0.02)
+    cloud = write_cloud(tmp_path / "c.laz", place.xyz)
+    assert main(["soil", str(cloud), "-o", str(tmp_path / "s.geojson"), "--json", str(tmp_path / "f.json")]) == 0
+    # walls, shrubs and crowns have feet that pass for ground: 6 in 100 m2 where they count
+    assert json.loads((tmp_path / "f.json").read_text())["patches"] / (side_m**2 / 100.0) < 0.15
