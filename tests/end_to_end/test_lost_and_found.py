@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flightlog.logfile import LogReader
-from groundproc.accuracy.judge import judge
+from groundproc.accuracy.alignment import align
+from groundproc.accuracy.poses import common_poses
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
 from groundproc.estimation.method import gather
@@ -41,8 +42,10 @@ def test_after_seconds_without_lidar_and_satellites_the_map_is_found_again(
     assert len(made.report["rejoined"]) == 1
     assert made.report["apart"] == 0
     placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
-    found = judge([], truth, placed, made.mount)
-    off = np.linalg.norm(found.courses["position_error_m"].reshape(len(found.courses["time_s"]), -1), axis=1)
-    seen = np.abs(found.courses["time_s"] - GAP_FROM_S - gap_s / 2.0) > gap_s / 2.0 + 0.5
-    assert np.sqrt(np.square(off[seen]).mean()) < 0.03
-    assert found.figures["aligned_position_within_2_sigma"] > 0.9
+    ours, theirs, _ = common_poses(placed, truth.trajectory)
+    lidar, true = ours.times_mount(made.mount), theirs.times_mount(truth.mount)
+    seen = np.abs(truth.lidar.elapsed_s(ours.time_ns) - GAP_FROM_S - gap_s / 2.0) > gap_s / 2.0 + 0.5
+    parts = (lidar.position_m, lidar.mat_local_body, true.position_m, true.mat_local_body)
+    motion = align(*(part[seen] for part in parts))
+    off = lidar.moved(motion).position_m[seen] - true.position_m[seen]
+    assert np.sqrt(np.square(off).sum(axis=1).mean()) < 0.03

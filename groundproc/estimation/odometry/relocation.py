@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 REACH_SIGMAS: Final = 3.5
 MARGIN: Final = np.array([1.0, 1.0, 1.0, np.deg2rad(1.0)])
-WIDEST: Final = np.array([45.0, 45.0, 24.0, np.deg2rad(15.0)])
+WIDEST: Final = np.array([60.0, 60.0, 45.0, np.deg2rad(15.0)])
 """How far east, north, up [m] and about the vertical [rad] a place is sought: so many sigmas and a margin. Where that is more than the
 widest, the true place may lie outside, and nothing is sought."""
 RADIUS_M: Final = 45.0
