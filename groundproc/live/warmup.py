@@ -5,9 +5,11 @@ import numpy as np
 from groundproc import sensors
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
 from groundproc.estimation.odometry.odometry import Odometry
+from groundproc.estimation.odometry.seeking import starts
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.spline import Path, integrated
 from groundproc.estimation.odometry.state import State
+from groundproc.estimation.odometry.surfaces import surfaces_of
 from groundproc.geodesy import LocalFrame
 from groundproc.live.motion import GrowingMotion
 from groundproc.live.slicer import Slicer
@@ -32,6 +34,8 @@ def warm_up() -> None:
     for number, seen in enumerate((floor, floor, floor, floor[:1], floor[:0])):
         times = number * SLICE_NS + np.linspace(0, SLICE_NS - 1, len(seen)).astype(np.int64)
         odometry.step(Slice(number, times, seen))
+    surfaces = surfaces_of(odometry.map, np.zeros(3), 100.0)
+    starts(surfaces, surfaces, np.zeros(3), np.ones(4))
     odometry.map.forget_beyond(np.zeros(3), 100.0)
     quat = integrated(rest[:STEPS], state.quat)
     cloud = VoxelCloud(1.0, 1 << 20)
