@@ -38,6 +38,9 @@ _SMALLEST_M: Final = 0.1
 _LARGEST_M: Final = 1.0
 _PER_EDGE: Final = 3.0
 """Spacings of points that an edge of a voxel holds."""
+LEFT_OUT: Final = 4
+"""In `change`: noise and what moves, which is not compared."""
+_KEPT: Final = {"epoch": "u1", "stands": "?", "east": "f4", "north": "f4", "up": "f4"}
 _COLUMNS: Final = {"change": "u1", "change_distance": "f4", "change_sigma": "f4"}
 
 
@@ -62,6 +65,8 @@ class Task:
     undulation_m : float
     surface : SurfaceTask or None
         Measure the distance of surfaces too, like this.
+    all_classes : bool
+        Noise and what moves are compared too.
     """
 
     a: Path
@@ -75,6 +80,7 @@ class Task:
     week: int | None = None
     undulation_m: float = 0.0
     surface: SurfaceTask | None = None
+    all_classes: bool = False
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:
@@ -96,7 +102,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     else:
         seen = (recovered(clouds[0]), recovered(clouds[1]))
         paths = seen if None not in seen else paths
-    epochs = laid(clouds, paths, task.registered, progress, (task.trajectory_a, task.trajectory_b))
+    epochs = laid(clouds, paths, task.registered, progress, (task.trajectory_a, task.trajectory_b), task.all_classes)
     per_m2 = epochs.per_m2
     edge = task.voxel_m or float(np.clip(_PER_EDGE / np.sqrt(per_m2), _SMALLEST_M, _LARGEST_M))
     rule = Rule(edge, task.sway_m if task.sway_m is not None else max(0.25, 2.0 * edge), epochs.registration, per_m2)
@@ -121,11 +127,12 @@ def _compare(task: Task, epochs: Epochs, rule: Rule, progress: Progress) -> tupl
     """Square by square, each epoch against the other."""
     points = epochs.clouds[0].points + epochs.clouds[1].points
     side = side_for(points, epochs.low.tolist(), epochs.high.tolist(), detection.HALO_M)
-    tiles = Tiles(task.folder, {"epoch": "u1", "east": "f4", "north": "f4", "up": "f4"}, side, detection.HALO_M)
+    tiles = Tiles(task.folder, _KEPT, side, detection.HALO_M)
     for number in range(2):
-        for _, xyz, away in epochs.chunks(number):
-            epoch = np.full(len(xyz), number, np.uint8)
-            tiles.add(xyz, {"epoch": epoch, "east": away[:, 0], "north": away[:, 1], "up": away[:, 2]})
+        for chunk, xyz, away in epochs.chunks(number):
+            columns: dict[str, npt.NDArray[Any]] = dict(zip(("east", "north", "up"), away.T, strict=True))
+            columns |= {"epoch": np.full(len(xyz), number, np.uint8), "stands": epochs.standing(chunk)}
+            tiles.add(xyz, columns)
             progress("placing", len(xyz))
     found = Found(task.folder, _COLUMNS, points)
     claims: list[tuple[str, Claim]] = []
@@ -133,7 +140,12 @@ def _compare(task: Task, epochs: Epochs, rule: Rule, progress: Progress) -> tupl
         origin = np.floor(tile.xyz_m.min(axis=0))
         way = np.stack([tile.columns[name] for name in ("east", "north", "up")], axis=1).astype(np.float64)
         local = replace(rule, registration=epochs.registration.seen_from(origin))
-        rows = [np.flatnonzero(tile.columns["epoch"] == number) for number in range(2)]
+        stands = tile.columns["stands"]
+        rows = [np.flatnonzero((tile.columns["epoch"] == number) & stands) for number in range(2)]
+        others = tile.number[tile.core & ~stands]
+        unknown = np.full(len(others), np.nan, np.float32)
+        left_out = np.full(len(others), LEFT_OUT, np.uint8)
+        found.put(others, {"change": left_out, "change_distance": unknown, "change_sigma": unknown})
         sides = [Side(tile.xyz_m[own] - origin, way[own]) for own in rows]
         models = [model(each, local) for each in sides]
         for number in (1, 0):

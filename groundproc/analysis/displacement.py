@@ -160,8 +160,9 @@ def _tiles(task: Task, epochs: Epochs, progress: Progress) -> Tiles:
         task.output.parent, {"epoch": "u1"}, side_for(points, epochs.low.tolist(), epochs.high.tolist(), halo), halo
     )
     for number in range(2):
-        for _, xyz, _ in epochs.chunks(number):
-            tiles.add(xyz, {"epoch": np.full(len(xyz), number, np.uint8)})
+        for chunk, xyz, _ in epochs.chunks(number):
+            some = xyz[epochs.standing(chunk)]
+            tiles.add(some, {"epoch": np.full(len(some), number, np.uint8)})
             progress(len(xyz))
     return tiles
 

@@ -14,6 +14,8 @@ from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
 from groundproc.cloud.metres import metres_of
 from groundproc.cloud.reader import Chunk, Cloud
+from groundproc.cloud.sameness import same
+from groundproc.cloud.selection import CLASS, standing
 from groundproc.radiometry.sensorpath import Flown, SensorPath, Tally
 
 Array = npt.NDArray[np.float64]
@@ -41,6 +43,8 @@ class Epochs:
         They were taken as they are; the registration is none.
     trajectories : tuple of 2 (Path or None)
         Files that the paths are of.
+    all_classes : bool
+        Noise and what moves are in surfaces too.
     """
 
     clouds: tuple[Cloud, Cloud]
@@ -51,11 +55,16 @@ class Epochs:
     registration: Registration
     registered: bool
     trajectories: tuple[Path | None, Path | None] = (None, None)
+    all_classes: bool = False
 
     @property
     def crs(self) -> pyproj.CRS | None:
         """Horizontal, of both."""
         return agreed_crs(self.clouds)
+
+    def standing(self, chunk: Chunk) -> npt.NDArray[np.bool_]:
+        """Which points of a chunk surfaces are made of."""
+        return standing(chunk.points, self.all_classes)
 
     def chunks(self, number: int, columns: tuple[str, ...] = ()) -> Iterator[tuple[Chunk, Array, Array]]:
         """Chunks of an epoch, their places in the frame of A, and the way from them to the sensor (0: not known)."""
@@ -63,7 +72,7 @@ class Epochs:
         tally = (
             Tally(trajectory, path, self.clouds[number]) if trajectory is not None and isinstance(path, Flown) else None
         )
-        for chunk in reader.chunks(self.clouds[number], None if path is None else path.clock, columns):
+        for chunk in reader.chunks(self.clouds[number], None if path is None else path.clock, (*columns, CLASS)):
             xyz = chunk.points.xyz_m
             away = np.zeros((len(xyz), 3))
             if path is not None:
@@ -99,6 +108,7 @@ def laid(
     registered: bool,
     progress: Progress,
     trajectories: tuple[Path | None, Path | None] = (None, None),
+    all_classes: bool = False,
 ) -> Epochs:
     """Look at both, and lay the later one on the earlier unless they lie so already.
 
@@ -115,10 +125,10 @@ def laid(
             raise GeodesyError(
                 f"{cloud.path}: is in {cloud.horizontal.name}, which is not in metres; expected a CRS that is"
             )
-    samples, low, high, per_m2 = _look(clouds, progress)
+    samples, low, high, per_m2 = _look(clouds, all_classes, progress)
     what = f"{clouds[0].path} and {clouds[1].path}"
     found = _unmoved(samples, what) if registered else register(samples[0], samples[1], what)
-    return Epochs(clouds, paths, low, high, per_m2, found, registered, trajectories)
+    return Epochs(clouds, paths, low, high, per_m2, found, registered, trajectories, all_classes)
 
 
 def agreed_crs(clouds: tuple[Cloud, Cloud]) -> pyproj.CRS | None:
@@ -130,27 +140,34 @@ def agreed_crs(clouds: tuple[Cloud, Cloud]) -> pyproj.CRS | None:
         They differ.
     """
     a, b = (cloud.horizontal for cloud in clouds)
-    if a is not None and b is not None and not a.equals(b, ignore_axis_order=True):
+    if a is not None and b is not None and not same(a, b):
         raise GeodesyError(f"{clouds[1].path}: is in {b.name}, but {clouds[0].path} in {a.name}; expected one CRS")
     return a if a is not None else b
 
 
-def _look(clouds: tuple[Cloud, Cloud], progress: Progress) -> tuple[list[Array], Array, Array, float]:
+def _look(
+    clouds: tuple[Cloud, Cloud], all_classes: bool, progress: Progress
+) -> tuple[list[Array], Array, Array, float]:
     """A sample of both for the registration, what they span, and points on a square metre of the sparser."""
     samples, density = [], []
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for cloud in clouds:
         step = max(1, -(-cloud.points // MOST))
-        parts, cells = [], np.empty(0, np.int64)
-        for chunk in reader.chunks(cloud, columns=()):
-            xyz = chunk.points.xyz_m
+        parts, cells, held = [], np.empty(0, np.int64), 0
+        for chunk in reader.chunks(cloud, columns=(CLASS,)):
+            progress("looking", len(chunk.points))
+            xyz = chunk.points.xyz_m[standing(chunk.points, all_classes)]
+            if not len(xyz):
+                continue
+            held += len(xyz)
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
             parts.append(xyz[::step])
             cell = np.floor(xyz[:, :2]).astype(np.int64)
             cells = np.union1d(cells, (cell[:, 0] << 32) + (cell[:, 1] & 0xFFFFFFFF))
-            progress("looking", len(xyz))
+        if not held:
+            raise CoverageError(f"{cloud.path}: holds nothing but noise and what moves, expected points of surfaces")
         samples.append(np.concatenate(parts))
-        density.append(cloud.points / max(len(cells), 1))
+        density.append(held / max(len(cells), 1))
     return samples, low, high, min(density)
 
 

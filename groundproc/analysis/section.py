@@ -12,6 +12,7 @@ import numpy.typing as npt
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.rewriter import Rewriter
+from groundproc.cloud.selection import CLASS, standing
 from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]
@@ -33,10 +34,17 @@ class Made:
     length_m: float
     lowest_m: float
     highest_m: float
+    no_surface: int = 0
+    """Points of noise and of what moves that would lie in it."""
 
 
 def section(
-    path: Path, output: Path, line_m: Sequence[float], width_m: float, progress: Callable[[int], object]
+    path: Path,
+    output: Path,
+    line_m: Sequence[float],
+    width_m: float,
+    progress: Callable[[int], object],
+    all_classes: bool = False,
 ) -> Made:
     """Write the points within half a width of a line, beyond its ends none.
 
@@ -51,6 +59,8 @@ def section(
     width_m : float
     progress : callable
         Told of points done.
+    all_classes : bool
+        Noise and what moves are in it too.
 
     Raises
     ------
@@ -65,14 +75,17 @@ def section(
         raise UsageError(f"a line of {length:g} m and a width of {width_m:g} m: expected more than 0 of both")
     cloud = reader.look(path)
     ahead = (end - start) / length
-    kept, low, high = 0, np.inf, -np.inf
+    kept, left_out, low, high = 0, 0, np.inf, -np.inf
     bounds = [np.full(2, np.inf), np.full(2, -np.inf)]
     with written_aside(output) as aside:
         with _writer(cloud, aside, output.suffix.lower()) as new:
-            for chunk in reader.chunks(cloud, columns=new.columns):
+            for chunk in reader.chunks(cloud, columns=(*new.columns, CLASS)):
                 away = chunk.points.xyz_m[:, :2] - start
                 along, across = away @ ahead, away @ np.array([-ahead[1], ahead[0]])
                 inside = (along >= 0.0) & (along <= length) & (np.abs(across) <= width_m / 2.0)
+                stands = standing(chunk.points, all_classes)
+                left_out += int(np.count_nonzero(inside & ~stands))
+                inside &= stands
                 xyz = chunk.points.xyz_m
                 bounds = [np.minimum(bounds[0], xyz[:, :2].min(axis=0)), np.maximum(bounds[1], xyz[:, :2].max(axis=0))]
                 if inside.any():
@@ -85,7 +98,7 @@ def section(
                 f"{path}: no point lies within {width_m / 2:g} m of the line; its points span {bounds[0][0]:.2f} to {bounds[1][0]:.2f} E "
                 f"and {bounds[0][1]:.2f} to {bounds[1][1]:.2f} N"
             )
-    return Made(kept, cloud.points, length, low, high)
+    return Made(kept, cloud.points, length, low, high, left_out)
 
 
 @contextlib.contextmanager

@@ -18,16 +18,15 @@ import numpy.typing as npt
 from flightlog import __version__
 from flightlog.errors import CaptureError, CoverageError, UsageError
 from groundproc.cloud import reader
-from groundproc.cloud.classes import NO_SURFACE
 from groundproc.cloud.metres import Metres, metres_of
 from groundproc.cloud.reader import Cloud
 from groundproc.cloud.rewriter import Rewriter
+from groundproc.cloud.selection import standing
 from groundproc.cloud.tiles import Found, Tile, Tiles, side_for
 from groundproc.files import written_aside
 from groundproc.numerics import movingsurface
 from groundproc.numerics.cellsample import CellSample
-from groundproc.numerics.movingsurface import NO_SURFACE as OFF_SURFACE
-from groundproc.numerics.movingsurface import RADII, RATIO, ROUGH, SMOOTHED, TOO_FAR, TOO_FEW
+from groundproc.numerics.movingsurface import NO_SURFACE, RADII, RATIO, ROUGH, SMOOTHED, TOO_FAR, TOO_FEW
 from groundproc.numerics.normals import Normals, normals
 
 Array = npt.NDArray[np.float64]
@@ -42,7 +41,7 @@ RECORD: Final = ("swath", 2, "how it was smoothed, JSON")
 _LEFT_OUT: Final = 5
 """State of points of a class that is no surface, and of echoes of two surfaces."""
 _WORDS: Final = {
-    SMOOTHED: "smoothed", OFF_SURFACE: "on no surface", ROUGH: "rougher than noise", TOO_FEW: "too few around",
+    SMOOTHED: "smoothed", NO_SURFACE: "on no surface", ROUGH: "rougher than noise", TOO_FEW: "too few around",
     TOO_FAR: "farther off than noise", _LEFT_OUT: "noise, moving or mixed",
 }  # fmt: skip
 _SAMPLE: Final = 600_000
@@ -176,9 +175,7 @@ def work(task: Task, progress: Progress) -> Made:
 def _usable(chunk: reader.Chunk) -> npt.NDArray[np.bool_]:
     """Points that may lie on a surface."""
     columns = chunk.points.columns
-    usable = np.ones(len(chunk.points), np.bool_)
-    if "classification" in columns:
-        usable &= ~np.isin(columns["classification"], NO_SURFACE)
+    usable = standing(chunk.points)
     if "mixed" in columns:
         usable &= columns["mixed"] == 0
     return usable

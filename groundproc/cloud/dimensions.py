@@ -217,7 +217,7 @@ TABLE: Final = (
     Dimension("along", "f8", "along the section", "Way along the line of a section.", "`swath section`", "m"),
     Dimension(
         "change", "u1", "0 same 1 new 2 gone 3 unseen",
-        "0 unchanged, 1 appeared, 2 vanished, 3 not looked into by the other epoch.", "`swath change`",
+        "0 unchanged, 1 appeared, 2 vanished, 3 not looked into by the other epoch, 4 noise or moving and not compared.", "`swath change`",
     ),
     Dimension(
         "change_distance", "f4", "from the other epoch", "Signed distance from the surface of the other epoch, above it positive; not a "

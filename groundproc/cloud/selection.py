@@ -127,6 +127,25 @@ SURFACES: Final = Classes()
 """What stands: neither noise nor what moved."""
 
 
+def standing(points: Points, all_classes: bool = False) -> Mask:
+    """THE rule for commands that make surfaces of some points and write all of them: of which surfaces are made, shape (n,).
+
+    Those that write none of the points leave the others out as they read: `reader.look(path, SURFACES)`.
+
+    Parameters
+    ----------
+    points : Points
+        With the column `classification` where the cloud has one.
+    all_classes : bool
+        The user wants noise and what moves in surfaces too.
+    """
+    return np.ones(len(points), np.bool_) if all_classes else SURFACES.keeps(points)
+
+
+CLASS: Final = _CLASS
+"""The column that the rule looks at."""
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """Several choices, one after the other.

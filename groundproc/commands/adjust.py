@@ -12,6 +12,7 @@ HELP = "adjust the strips of a cloud of any origin: LAS files and a trajectory i
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("clouds", nargs="*", type=Path, metavar="LAS", help="LAS or LAZ files with gps_time")
     parser.add_argument(
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="taken off the trajectory's heights, where those of the cloud are above the geoid [m]",
     )  # fmt: skip
     parser.add_argument("--control", type=Path, metavar="CSV", help="points on the surface: columns x, y, z, sigma")
+    add_all_classes(parser)
     parser.add_argument("--config", type=Path, metavar="FILE", help="options as YAML; --show-config lists them")
     parser.add_argument("--show-config", action="store_true", help="print every option with its default and exit")
     parser.add_argument("--json", action="store_true", help="print what adjustment.json holds")
@@ -40,6 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Adjust, and say what it was good for."""
+    from dataclasses import replace
+
     from tqdm import tqdm
 
     from flightlog import config
@@ -60,6 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     expect([arguments.control], ("control", "table"), "a table of control points (CSV: x, y, z, sigma)")
     expect_text(arguments.config, "options as YAML")
     options = config.load(arguments.config, StripOptions) if arguments.config else StripOptions()
+    options = replace(options, all_classes=options.all_classes or arguments.all_classes)
 
     from groundproc.strips import report, work
 
@@ -104,6 +109,10 @@ def _text(told: dict[str, Any], folder: Path) -> str:
     if told["points"]["outside_trajectory"]:
         lines.append(
             f"{told['points']['outside_trajectory']:,} points lie outside of the trajectory and are as they were"
+        )
+    if told["points"]["no_surface"]:
+        lines.append(
+            f"{told['points']['no_surface']:,} points of noise and of what moves were moved along, but told nothing"
         )
     if told["note"]:
         lines.append(f"note: {told['note']}")

@@ -10,6 +10,7 @@ HELP = "compare two epochs of a place: register them, and find what appeared or 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("a", type=Path, metavar="A", help="the earlier cloud: LAS, LAZ or COPC")
     parser.add_argument("b", type=Path, metavar="B", help="the later one")
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--registered", action="store_true", help="the clouds lie on each other already")
     parser.add_argument("--week", type=int, metavar="N", help="GPS week, where the files have only seconds of it")
     parser.add_argument("--geoid", type=float, default=0.0, metavar="N", help="taken off the trajectories' heights [m]")
+    add_all_classes(parser)
     surfaces = parser.add_argument_group(
         "surfaces", "how far the ground moved along its normals (M3C2), and what was lost and gained"
     )
@@ -74,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         claim_file(arguments.json, (".json",), arguments.force)
     task = Task(
         arguments.a, arguments.b, arguments.output, arguments.trajectory_a, arguments.trajectory_b, arguments.voxel, arguments.sway,
-        arguments.registered, arguments.week, arguments.geoid, measured,
+        arguments.registered, arguments.week, arguments.geoid, measured, arguments.all_classes,
     )  # fmt: skip
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

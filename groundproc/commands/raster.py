@@ -10,6 +10,7 @@ HELP = "make a raster of clouds: surface model, intensity, density, hillshade, a
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument(
         "clouds", nargs="+", type=Path, metavar="CLOUD",
@@ -30,9 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tiles", type=float, metavar="M", help="side of tiles [m]: -o is a folder then, with an index (.vrt)"
     )
-    parser.add_argument(
-        "--all-classes", action="store_true", help="noise and what moves (classes 7, 18 and 69) count too"
-    )
+    add_all_classes(parser)
     parser.add_argument("--crs", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="the raster, .tif; with --tiles a folder"

@@ -11,6 +11,7 @@ HELP = "calibrate intensities: the diffuse reflectance of every echo, from targe
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("clouds", nargs="+", type=Path, metavar="CLOUD", help="LAS, LAZ or COPC files of one flight")
     parser.add_argument(
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="sensor in the body frame of the trajectory [m]; default: 0 0 0",
     )  # fmt: skip
     add_place(parser)
+    add_all_classes(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the results")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)
@@ -71,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     task = Task(
         arguments.clouds, arguments.output, arguments.trajectory, arguments.targets, arguments.intensity,
         arguments.visibility_km, arguments.wavelength_nm, None if arguments.crs is None else projected_crs(arguments.crs),
-        arguments.week, arguments.geoid, tuple(arguments.lever),
+        arguments.week, arguments.geoid, tuple(arguments.lever), arguments.all_classes,
     )  # fmt: skip
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

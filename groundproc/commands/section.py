@@ -11,9 +11,11 @@ HELP = "cut a slice out of a cloud, along a line"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
     parser.add_argument("--line", required=True, metavar="E,N,E,N", help="both ends, in the CRS of the cloud")
+    add_all_classes(parser)
     parser.add_argument("--width", type=float, default=0.5, metavar="W", help="of the slice [m]; default: 0.5")
     parser.add_argument(
         "-o",
@@ -50,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         if path is not None:
             claim_file(path, (suffix,), arguments.force)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
-        made = section(arguments.cloud, arguments.output, line, arguments.width, bar.update)
+        made = section(arguments.cloud, arguments.output, line, arguments.width, bar.update, arguments.all_classes)
         if arguments.picture is not None:
             from groundproc.analysis.sectionplot import draw
 
@@ -58,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
                 drawn = arguments.output
                 if drawn.suffix.lower() not in CLOUD_ENDINGS:  # a picture is drawn of the slice as a cloud
                     drawn = Path(folder) / "section.laz"
-                    section(arguments.cloud, drawn, line, arguments.width, bar.update)
+                    section(arguments.cloud, drawn, line, arguments.width, bar.update, arguments.all_classes)
                 draw(drawn, arguments.picture, arguments.colour)
     if arguments.json is not None:
         write_json(arguments.json, asdict(made))
@@ -67,4 +69,6 @@ def run(arguments: argparse.Namespace) -> int:
         f"{made.points:,} of {made.of:,} points, {made.length_m:.2f} m long, {made.lowest_m:.2f} to {made.highest_m:.2f} m high; "
         f"{arguments.output}"
     )
+    if made.no_surface:
+        print(f"{made.no_surface:,} points of noise and of what moves were left out; --all-classes takes them")
     return 0

@@ -36,6 +36,13 @@ def add_selection(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_all_classes(parser: argparse.ArgumentParser) -> None:
+    """Declare the one option by which surfaces are made of noise and of what moves too."""
+    parser.add_argument(
+        "--all-classes", action="store_true", help="noise and what moves (classes 7, 18 and 69) count too"
+    )
+
+
 def asked(arguments: argparse.Namespace) -> bool:
     """Whether part of the cloud is wanted only."""
     return any(getattr(arguments, name) is not None for name in WORDS)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from flightlog.errors import CaptureError
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 from groundproc.imagery.bundle.block import LIDAR, Block, PointRows, joined_rows
 from groundproc.imagery.site import Site
 
@@ -59,7 +60,7 @@ def read_surface(path: Path, site: Site, told: Callable[[int], None]) -> Surface
     CaptureError
         It cannot be read, or has no points.
     """
-    cloud = reader.look(path)
+    cloud = reader.look(path, SURFACES)
     cell = _CELL_M
     parts: list[Array] = []
     total = 0

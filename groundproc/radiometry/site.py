@@ -56,6 +56,8 @@ class Task:
         Taken off the trajectory's heights.
     lever_m : sequence of 3 floats
         Sensor in the body frame: right, forward, up.
+    all_classes : bool
+        Noise and what moves are looked at as surfaces too.
     """
 
     clouds: Sequence[Path]
@@ -69,6 +71,7 @@ class Task:
     week: int | None = None
     undulation_m: float = 0.0
     lever_m: Sequence[float] = (0.0, 0.0, 0.0)
+    all_classes: bool = False
 
 
 @dataclass(slots=True)

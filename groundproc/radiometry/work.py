@@ -13,7 +13,8 @@ from flightlog.errors import CoverageError
 from groundproc.cloud import reader
 from groundproc.cloud.reader import Chunk
 from groundproc.cloud.rewriter import Rewriter
-from groundproc.cloud.tiles import Found, Tiles, side_for
+from groundproc.cloud.selection import CLASS, standing
+from groundproc.cloud.tiles import Found, Tile, Tiles, side_for
 from groundproc.files import made_folder, written_aside
 from groundproc.numerics import normals
 from groundproc.radiometry import report, signal
@@ -34,7 +35,8 @@ _LEAST_KNOWN_RAD: Final = np.deg2rad(2.0)
 _LEAVES: Final = 0.5
 """Relative sigma of an echo from no surface, whose incidence is taken as 0."""
 _KEPT: Final = {
-    "strength": "f4", "range": "f4", "east": "f4", "north": "f4", "up": "f4", "laser": "u1", "strip": "u2", "single": "?"
+    "strength": "f4", "range": "f4", "east": "f4", "north": "f4", "up": "f4", "laser": "u1", "strip": "u2", "single": "?",
+    "stands": "?",
 }  # fmt: skip
 _FOUND: Final = {"range": "f4", "cosine": "f4", "tilt": "f4"}
 
@@ -62,7 +64,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
 
 def _placed(site: Site, progress: Progress, stage: str) -> Iterator[tuple[Chunk, int, Array, npt.NDArray[np.bool_]]]:
     for number, cloud in enumerate(site.clouds):
-        for chunk in reader.chunks(cloud, site.path.clock, ("laser", "range", "point_source_id")):
+        for chunk in reader.chunks(cloud, site.path.clock, ("laser", "range", "point_source_id", CLASS)):
             place, known = site.path.at(chunk)
             yield chunk, number, place, known
             progress(stage, len(chunk.points))
@@ -102,7 +104,7 @@ def _surfaces(site: Site, progress: Progress) -> Found:
             "strength": strength, "range": range_m, "east": away[:, 0], "north": away[:, 1], "up": away[:, 2],
             "laser": chunk.points.columns.get("laser", np.zeros(len(source), np.uint8)),
             "strip": source if len(site.clouds) == 1 or source.any() else np.full(len(source), number, np.uint16),
-            "single": single,
+            "single": single, "stands": standing(chunk.points, site.task.all_classes),
         })  # fmt: skip
         sample.add(raw[known], range_m[known], chunk.points.columns.get("range"), known)
     check_path(site, sample)
@@ -110,6 +112,10 @@ def _surfaces(site: Site, progress: Progress) -> Found:
         each.check()
     found = Found(folder, _FOUND, survey.points)
     for tile in tiles:
+        others = tile.core & ~tile.columns["stands"]
+        unknown = np.full(int(others.sum()), np.nan, np.float32)
+        found.put(tile.number[others], {"range": tile.columns["range"][others], "cosine": unknown, "tilt": unknown})
+        tile = _masked(tile, tile.columns["stands"])
         lies = normals.normals(tile.xyz_m)
         core = np.flatnonzero(tile.core)
         columns = {name: values[core] for name, values in tile.columns.items()}
@@ -122,6 +128,11 @@ def _surfaces(site: Site, progress: Progress) -> Found:
         _gather(site, tile.xyz_m[core], columns, cosine, tilt)
         progress("surfaces", len(core))
     return found
+
+
+def _masked(tile: Tile, wanted: npt.NDArray[np.bool_]) -> Tile:
+    columns = {name: values[wanted] for name, values in tile.columns.items()}
+    return Tile(tile.xyz_m[wanted], tile.number[wanted], tile.core[wanted], columns)
 
 
 def _gather(site: Site, xyz_m: Array, columns: dict[str, npt.NDArray[Any]], cosine: Array, tilt: Array) -> None:

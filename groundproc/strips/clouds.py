@@ -14,6 +14,7 @@ from groundproc.cloud import reader
 from groundproc.cloud.gpstime import Clock
 from groundproc.cloud.reader import Cloud
 from groundproc.cloud.rewriter import Rewriter
+from groundproc.cloud.selection import CLASS, standing
 from groundproc.files import written_aside
 
 Array = npt.NDArray[np.float64]
@@ -35,6 +36,8 @@ class Chunk:
         UTC.
     source : ndarray of int64, shape (n,)
         Point source id.
+    stands : ndarray of bool, shape (n,)
+        Of which patches are made.
     """
 
     file: int
@@ -42,6 +45,7 @@ class Chunk:
     xyz_m: Array
     time_ns: Ints
     source: Ints
+    stands: npt.NDArray[np.bool_]
 
 
 def look(path: Path) -> Cloud:
@@ -60,8 +64,8 @@ def look(path: Path) -> Cloud:
     return cloud
 
 
-def chunks(clouds: Sequence[Cloud], clock: Clock) -> Iterator[Chunk]:
-    """All points of all files, in their order.
+def chunks(clouds: Sequence[Cloud], clock: Clock, all_classes: bool = False) -> Iterator[Chunk]:
+    """All points of all files, in their order; with `all_classes` patches are made of noise and of what moves too.
 
     Raises
     ------
@@ -69,10 +73,10 @@ def chunks(clouds: Sequence[Cloud], clock: Clock) -> Iterator[Chunk]:
         A file is damaged, or has no times.
     """
     for number, cloud in enumerate(clouds):
-        for chunk in reader.chunks(cloud, clock, ("point_source_id",)):
+        for chunk in reader.chunks(cloud, clock, ("point_source_id", CLASS)):
             points = chunk.points
             source = points["point_source_id"].astype(np.int64)
-            yield Chunk(number, chunk.record, points.xyz_m, points.time_ns, source)
+            yield Chunk(number, chunk.record, points.xyz_m, points.time_ns, source, standing(points, all_classes))
 
 
 @contextlib.contextmanager

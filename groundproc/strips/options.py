@@ -42,3 +42,4 @@ class StripOptions:
         1_000_000, "patches kept; beyond it whole voxels are thinned, so that memory is bounded",
         minimum=1000, maximum=20_000_000,
     )  # fmt: skip
+    all_classes: bool = option(False, "patches are made of noise and of what moves too (classes 7, 18 and 69)")

@@ -124,7 +124,8 @@ def _tree(facts: Facts, sigma: Array) -> dict[str, Any]:
         "config": config.to_mapping(site.options),
         "control": None if facts.control is None else facts.control.name,
         "points": {
-            "read": sum(cloud.points for cloud in site.clouds), "outside_trajectory": site.outside, "moved": facts.moved.summary(),
+            "read": sum(cloud.points for cloud in site.clouds), "outside_trajectory": site.outside, "no_surface": site.no_surface,
+            "moved": facts.moved.summary(),
         },
         "strips": {
             "count": len(strips), "cut_by": strips.by, "headings_differ_deg": round(np.rad2deg(headings_differ(site.route, strips)), 1),

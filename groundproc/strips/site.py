@@ -25,6 +25,7 @@ class Site:
     route: Route
     options: StripOptions
     outside: int = 0
+    no_surface: int = 0
 
     def placed(self, chunk: Chunk) -> tuple[npt.NDArray[np.bool_], Array, Array, Array]:
         """Which points have a pose, and for all of them place less the origin, scanner, and attitude; shape (n, 3) and (n, 4)."""

@@ -156,14 +156,15 @@ def _survey(site: Site, progress: Progress) -> tuple[Strips, float, Sigmas]:
     """First pass: when there are points and how dense they are."""
     occupancy, density = Occupancy(site.route), Density()
     total, first, last = 0, None, 0
-    for chunk in chunks(site.clouds, site.clock):
+    for chunk in chunks(site.clouds, site.clock, site.options.all_classes):
         _, covered = site.route.poses.where_covered(chunk.time_ns)
         total += len(covered)
         site.outside += int((~covered).sum())
         low, high = int(chunk.time_ns.min()), int(chunk.time_ns.max())
         first, last = low if first is None else min(first, low), max(last, high)
         occupancy.add(chunk.time_ns[covered], chunk.source[covered], chunk.file)
-        density.add(chunk.xyz_m[covered] - site.route.origin_m)
+        site.no_surface += int((~chunk.stands).sum())
+        density.add(chunk.xyz_m[covered & chunk.stands] - site.route.origin_m)
         progress("times", len(covered))
     if site.outside > total // 2:
         times = site.route.poses.time_ns
@@ -193,11 +194,11 @@ def _patches(
 ) -> tuple[npt.NDArray[np.void], Differences, float, float]:
     """Second pass: clusters, differences as they are, share of voxels kept, and the usual distance from the scanner."""
     gatherer, patches = Gatherer(0.5 * voxel_m, site.options.clusters), Patches(voxel_m)
-    for chunk in chunks(site.clouds, site.clock):
+    for chunk in chunks(site.clouds, site.clock, site.options.all_classes):
         covered, place, scanner, quat = site.placed(chunk)
         strip = strips.of(chunk.time_ns)
-        strip[~covered] = -1
-        use = covered
+        use = covered & chunk.stands
+        strip[~use] = -1
         bins = (chunk.time_ns - strips.start_ns) // BIN_NS
         gatherer.add(chunk.time_ns[use], place[use], scanner[use], quat[use], strip[use], bins[use])
         patches.add(place, strip)
@@ -218,14 +219,14 @@ def _write(
     moved = report.Moved()
     with contextlib.ExitStack() as stack:
         writers = stack.enter_context(rewriters(site.clouds, task.folder))
-        for chunk in chunks(site.clouds, site.clock):
+        for chunk in chunks(site.clouds, site.clock, site.options.all_classes):
             covered, place, scanner, quat = site.placed(chunk)
             move, _ = adjusted.correction.moved(chunk.time_ns, place - scanner, quat)
             move[~covered] = 0.0
             stored = writers[chunk.file].write(chunk.record, move)
             moved.add(move[covered])
             strip = strips.of(chunk.time_ns)
-            strip[~covered] = -1
+            strip[~(covered & chunk.stands)] = -1
             patches.add(stored - site.route.origin_m, strip)
             progress("points", len(covered))
         after = patches.differences()

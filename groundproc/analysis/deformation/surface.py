@@ -147,9 +147,9 @@ def _measured(
     for number, cloud in enumerate(epochs.clouds):
         asked = tuple(name for name in (*_SIGMAS, "classification") if name in cloud.columns)
         for chunk, xyz, _ in epochs.chunks(number, asked):
-            keep = np.ones(len(xyz), np.bool_)
+            keep = epochs.standing(chunk)
             if task.ground:
-                keep = np.asarray(chunk.points.columns.get("classification", np.zeros(len(xyz)))) == _GROUND
+                keep &= np.asarray(chunk.points.columns.get("classification", np.zeros(len(xyz)))) == _GROUND
             sigmas = {name: _sigma(chunk.points, name)[keep] for name in _SIGMAS}
             tiles.add(xyz[keep], {"epoch": np.full(int(keep.sum()), number, np.uint8), **sigmas})
             progress("placing", len(xyz))

@@ -13,6 +13,7 @@ import pyproj
 
 from flightlog.errors import CaptureError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 from groundproc.imagery.painting.block import COLOURS, Block, Layer, load
 from groundproc.imagery.painting.charts import Chart, charts
 from groundproc.imagery.painting.gltf import Piece, write_glb
@@ -96,7 +97,7 @@ def mesh(task: Task, progress: Progress) -> Made:
     ------
     CaptureError, ConfigError, UsageError, SourceError
     """
-    cloud = reader.look(task.cloud)
+    cloud = reader.look(task.cloud, SURFACES)
     crs = task.crs or cloud.horizontal
     block = load(task.images, task.photos, crs, task.cloud)
     layer = _colours(block, task.images)

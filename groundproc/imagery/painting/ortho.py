@@ -13,6 +13,7 @@ import pyproj
 
 from flightlog.errors import UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.imagery.painting.balance import gains
 from groundproc.imagery.painting.block import COLOURS, Block, Layer, load
@@ -116,7 +117,7 @@ def ground(
         folder = Path(scratch)
         scene = Scene(look, block.site, folder, lambda n: progress("reading", n))
         spacing_m = float(np.median([square.spacing_m for square in scene.squares]))
-        surface = surface_of(look, spacing_m, gsd_m)
+        surface = surface_of(reader.look(cloud, SURFACES), spacing_m, gsd_m)
         yield Ground(look, block, scene, surface, _fine(surface.grid, gsd_m), folder)
 
 

@@ -116,3 +116,72 @@ def test_the_ground_is_that_of_the_clean_cloud_and_what_moves_stays_so(folder: P
     assert same.all()
     assert (np.asarray(dirty.classification)[given == 69] == 69).all()
     assert np.isin(np.asarray(dirty.classification)[np.isin(given, [7, 18])], [7, 18]).all()
+
+
+def test_changes_and_moves_of_surfaces_are_those_of_the_clean_cloud(folder: Path, tmp_path: Path) -> None:
+    told = []
+    for name in ("clean", "dirty"):
+        out = tmp_path / name
+        run(
+            "change",
+            folder / "clean.laz",
+            folder / f"{name}.laz",
+            "--registered",
+            "--surface",
+            "-o",
+            out,
+            "--json",
+            out / "f.json",
+        )
+        told.append(json.loads((out / "f.json").read_text()))
+    surfaces = [each.pop("surface") for each in told]
+    assert told[0] == told[1]
+    # squares follow the number of points, and with them where distances are measured
+    assert surfaces[0]["areas"] == surfaces[1]["areas"] == 0
+    assert surfaces[0]["lod95_m"] == pytest.approx(surfaces[1]["lod95_m"], rel=0.05)
+    made = laspy.read(tmp_path / "dirty" / "change.laz")
+    junk = np.isin(np.asarray(made.classification), JUNK)
+    assert junk.sum() == 6_000
+    assert len(made.points) == 60_000 + 66_000  # every point that came in
+    assert (np.asarray(made.change)[junk] == 4).all()
+    assert np.isnan(np.asarray(made.change_distance)[junk]).all()
+    assert (np.asarray(made.change)[~junk] != 4).all()
+
+
+def test_noise_is_a_change_where_it_is_asked_for(folder: Path, tmp_path: Path) -> None:
+    run(
+        "change",
+        folder / "clean.laz",
+        folder / "dirty.laz",
+        "--registered",
+        "--all-classes",
+        "-o",
+        tmp_path,
+        "--json",
+        tmp_path / "f.json",
+    )
+    assert not (np.asarray(laspy.read(tmp_path / "change.laz").change) == 4).any()
+
+
+def test_a_section_shows_what_stands(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ("--line", f"{EAST + 5},{NORTH + 20},{EAST + 35},{NORTH + 20}")
+    for name, words in (("clean", ()), ("dirty", ()), ("dirty", ("--all-classes",))):
+        run("section", folder / f"{name}.laz", *line, *words, "-o", tmp_path / f"{name}{len(words)}.laz")
+    clean, dirty, everything = (laspy.read(tmp_path / f"{name}.laz") for name in ("clean0", "dirty0", "dirty1"))
+    np.testing.assert_array_equal(clean.xyz, dirty.xyz)
+    left_out = len(everything.points) - len(dirty.points)
+    assert left_out > 50
+    assert f"{left_out:,} points of noise and of what moves were left out" in capsys.readouterr().out
+    assert np.isin(np.asarray(everything.classification), JUNK).sum() == left_out
+
+
+def test_a_cloud_of_noise_alone_is_one_sentence(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    las = laspy.read(folder / "clean.laz")
+    las.classification = np.full(len(las.points), 7, np.uint8)
+    las.write(tmp_path / "n.laz")
+    words = ["change", str(folder / "clean.laz"), str(tmp_path / "n.laz"), "-o", str(tmp_path / "o")]
+    assert main(words) == 1
+    assert "n.laz: holds nothing but noise and what moves, expected points of surfaces" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()

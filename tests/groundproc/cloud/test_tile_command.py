@@ -110,6 +110,37 @@ def test_the_index_is_stac_and_says_where_and_what_the_tiles_are(tmp_path: Path)
     assert len(by_gdal[2]) == len(tiles)
 
 
+def test_the_index_is_what_qgis_and_pdal_wrench_look_for(tmp_path: Path) -> None:
+    """The rules of their readers (QGIS's provider of virtual point clouds, wrench's vpc.cpp and vpc-spec.md), followed by hand."""
+    cloud(tmp_path / "1.laz")
+    tiled(tmp_path, str(tmp_path / "1.laz"))
+    tree = json.loads((tmp_path / "tiles" / "cloud.vpc").read_text())
+    assert tree["type"] == "FeatureCollection"
+    for item in tree["features"]:
+        assert (item["type"], item["stac_version"]) == ("Feature", "1.0.0")
+        assert all(isinstance(item[name], dict) for name in ("assets", "properties", "geometry"))
+        # both sort names, and the first asset is the data
+        first = item["assets"][min(item["assets"])]
+        assert first["href"].startswith("./")
+        assert first["href"].endswith("copc.laz")
+        assert (tmp_path / "tiles" / first["href"]).is_file()
+        views = [each for each in item["assets"].values() if "overview" in each["roles"]]
+        assert [each["href"] for each in views] == ["./overview.copc.laz"]
+        told = item["properties"]
+        assert isinstance(told["pc:count"], int)
+        assert isinstance(told["proj:wkt2"], str)
+        assert "proj:epsg" not in told, "QGIS would take it for a number of its own"
+        low, high = np.array(told["proj:bbox"][:3]), np.array(told["proj:bbox"][3:])
+        assert (low <= high).all()
+        (ring,) = told["proj:geometry"]["coordinates"]
+        assert ring[0] == ring[-1]
+        assert {(x, y) for x, y in ring} == {(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])}
+        for each in told["pc:schemas"]:
+            assert isinstance(each["size"], int)
+            assert each["type"] in ("floating", "unsigned", "signed")
+        assert all(len(place) >= 2 for place in item["geometry"]["coordinates"][0])
+
+
 def test_the_overview_is_a_few_points_of_every_tile(tmp_path: Path) -> None:
     source = cloud(tmp_path / "1.laz", count=200_000, rough_m=0.05)
     tiled(tmp_path, str(tmp_path / "1.laz"))

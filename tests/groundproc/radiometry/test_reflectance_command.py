@@ -86,6 +86,35 @@ def test_compensated_intensities_become_reflectance(tmp_path: Path) -> None:
     assert told["c_cal_sigma"] < 0.02 * true
 
 
+def test_noise_and_what_moves_tell_nothing_and_get_a_value_all_the_same(tmp_path: Path) -> None:
+    made = scene(response=lambda s, r: 80.0 * s)
+    echoes = made.make()
+    clean, told = run(tmp_path, made, echoes, "--targets", str(targets(tmp_path / "t.geojson")))
+    rng = np.random.default_rng(9)
+    few = rng.choice(len(clean), len(clean) // 20, replace=False)
+    # what flies and what walks by, bright, above the panels and the field
+    dirty = {name: np.concatenate([values, values[few]]) for name, values in echoes.items()}
+    dirty["xyz"][len(clean) :, 2] += rng.uniform(0.2, 0.6, len(few))
+    dirty["intensity"][len(clean) :] = 60.0
+    track, path = tmp_path / "trajectory.csv", write_cloud(tmp_path / "d.laz", dirty)
+    las = laspy.read(path)
+    las.classification[len(clean) :] = rng.choice([7, 18, 69], len(few))
+    las.write(path)
+    words = ["reflectance", str(path), "--trajectory", str(track), "--targets", str(tmp_path / "t.geojson")]
+    assert main([*words, "-o", str(tmp_path / "dirty")]) == 0
+    found = laspy.read(tmp_path / "dirty" / "d.laz")
+    assert len(found) == len(dirty["xyz"])
+    again = json.loads((tmp_path / "dirty" / "calibration.json").read_text())
+    assert again["c_cal"] == pytest.approx(told["c_cal"], rel=1e-3)
+    assert again["points"]["on_surface"] == pytest.approx(told["points"]["on_surface"], rel=1e-3)
+    rest = np.asarray(found["reflectance"])[: len(clean)]
+    np.testing.assert_allclose(rest, clean["reflectance"], rtol=0.02, atol=0.002)
+    assert np.isfinite(found["reflectance"][len(clean) :]).mean() > 0.9
+    assert main([*words, "-o", str(tmp_path / "all"), "--all-classes"]) == 0
+    everything = json.loads((tmp_path / "all" / "calibration.json").read_text())
+    assert everything["points"]["on_surface"] != again["points"]["on_surface"]
+
+
 @pytest.mark.parametrize("visibility", [None, 3.0])
 def test_amplitudes_are_freed_of_range_and_air(tmp_path: Path, visibility: float | None) -> None:
     # 3.91 / 3 km (905 / 550)^-(0.585 x 3^(1/3))

@@ -78,6 +78,35 @@ def test_nothing_but_coordinates_changes(adjusted: Any) -> None:
     np.testing.assert_allclose(new.header.mins, [new.x.min(), new.y.min(), new.z.min()], atol=1e-6)
 
 
+def test_noise_and_what_moves_are_moved_along_and_tell_nothing(
+    adjusted: Any, wrong_scan: aerial.Scan, tmp_path: Path
+) -> None:
+    aerial.write_las(tmp_path / "cloud.laz", wrong_scan, wrong_scan.placed_m)
+    las = laspy.read(tmp_path / "cloud.laz")
+    rng = np.random.default_rng(8)
+    # one plate in the air over all of the town, another over one strip
+    few = rng.choice(len(las.points), len(las.points) // 10, replace=False)
+    junk = las.points[few].copy()
+    junk.Z[:] = junk.Z + np.int32(40_000) + (np.arange(len(few)) % 3 * 300).astype(np.int32)
+    junk.classification[:] = rng.choice([7, 18, 69], len(few))
+    with laspy.open(tmp_path / "cloud.laz", mode="a") as file:
+        file.append_points(junk)
+    aerial.write_csv(tmp_path / "given.csv", wrong_scan.wrong)
+    (tmp_path / "options.yaml").write_text(
+        "{position_sigma_m: 0.15, attitude_sigma_deg: 0.05, position_time_s: 15, attitude_time_s: 15}"
+    )
+    words = ["adjust", str(tmp_path / "cloud.laz"), "-t", str(tmp_path / "given.csv"), "-o", str(tmp_path / "out")]
+    assert main([*words, "--config", str(tmp_path / "options.yaml")]) == 0
+    told = json.loads((tmp_path / "out" / "adjustment.json").read_text())
+    assert told["points"]["no_surface"] == len(few)
+    assert told["mount"] == adjusted.told["mount"]
+    after, clean = laspy.read(tmp_path / "out" / "cloud.laz"), laspy.read(adjusted.folder / "cloud.laz")
+    assert len(after.points) == len(las.points) + len(few)
+    np.testing.assert_array_equal(after.xyz[: len(clean.points)], clean.xyz)
+    moved = after.xyz[len(clean.points) :] - laspy.read(tmp_path / "cloud.laz").xyz[len(clean.points) :]
+    assert np.median(np.linalg.norm(moved, axis=1)) > 0.05
+
+
 def test_pictures_are_pictures(adjusted: Any) -> None:
     for name in ("differences.png", "corrections.png"):
         assert (adjusted.folder / name).read_bytes().startswith(b"\x89PNG")
