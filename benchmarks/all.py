@@ -18,7 +18,8 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "benchmarks.md"
 FIGURES: Final = ROOT / "docs" / "benchmarks.json"
 NO_BENCHMARKS: Final = (
-    "all", "drawing", "imagery_painting", "long_log", "machine", "mutations", "uses_clouds", "uses_ground",
+    "all", "drawing", "imagery_painting", "long_log", "machine", "mutations", "uses_banks", "uses_change", "uses_closeups",
+    "uses_clouds", "uses_ground",
 )  # fmt: skip
 """This one, what others use, and what measures the tests."""
 ON_DEMAND: Final = ("kit", "study", "windows")

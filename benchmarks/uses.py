@@ -7,9 +7,12 @@ Recordings are found by SWATH_RECORDINGS; where it is unset their figures are nu
 
 reflectance_error         largest error of the mean of a panel or a cell of 1 m with 100 echoes or more, up to 70 deg of incidence
 strip_bias_percent        largest difference of a strip of lasR's bcts from the others, single echoes in cells of 2 m
+strip_cells_percent       how far single cells of a strip are off, the median, there
 change_detection_rate     share of boxes of 1 dm3 found, 1000 points/m2 amid swaying shrubs
 change_false_per_100m2    claims that are none, there
 (those of uses_clouds.py)  ground, detection, wires, trees, buildings
+(those of uses_banks.py)  banks, water lines, slides
+(those of uses_closeups.py)  tall grass, the edge of a wood, a road, from 4 m
 (those of uses_change.py)  what moved between two flights
 (those of uses_ground.py)  soil, moving things, panes, pipes, passability
 sight_exact_agreement     share of cells of 200 random surfaces where `exact` says what a dense walk along the line says
@@ -32,7 +35,9 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import uses_banks
 import uses_change
+import uses_closeups
 import uses_clouds
 import uses_ground
 from scipy.ndimage import gaussian_filter
@@ -123,6 +128,8 @@ def strips() -> Figures:
     return {
         "strip_bias_percent": max(abs(each["reflectance_percent"]) for each in told["strips"]),
         "strip_bias_raw_percent": max(abs(each["raw_percent"]) for each in told["strips"]),
+        "strip_cells_percent": max(each["reflectance_cells_percent"] for each in told["strips"]),
+        "strip_cells_raw_percent": max(each["raw_cells_percent"] for each in told["strips"]),
     }
 
 
@@ -259,7 +266,9 @@ FIGURES: Final[dict[str, Callable[[], Figures]]] = {
     "strips": strips,
     "change": change,
     "sight": sight,
+    **uses_banks.FIGURES,
     **uses_change.FIGURES,
+    **uses_closeups.FIGURES,
     **uses_clouds.FIGURES,
     **uses_ground.FIGURES,
 }

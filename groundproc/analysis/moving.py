@@ -3,6 +3,7 @@
 Only what moved is kept in memory: some hundredth of a cloud. It is looked at in stretches of ten seconds.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,12 +22,14 @@ from groundproc.cloud.gpstime import Clock
 from groundproc.cloud.metres import metres_of, unstated
 from groundproc.files import written_aside
 from groundproc.vectors.features import Features, write_features
+from groundproc.verdict import warnings_in
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
 
 CLOUDS: Final = ("cloud.laz", "cloud.copc.laz")
 """Of a folder of `swath process`."""
+QUALITY: Final = "quality.json"
 EVERY_S: Final = 0.5
 _STRETCH_S: Final = 10.0
 _SIGMAS: Final = 2.0
@@ -112,16 +115,28 @@ def work(task: Task, progress: Progress) -> Made:
     made.tracks, made.unsure = sure, len(found) - len(sure)
     made.in_tracks = sum(each.points for each in sure)
     if not made.points:
-        made.warnings.append(
-            f"{cloud.path}: no point of class {MOVING}, which `swath process` gives to what moved where the trajectory is good "
-            "enough to tell"
-        )
+        made.warnings.append(f"{cloud.path}: no point of class {MOVING}: {_why_none(cloud.path)}")
     with written_aside(task.output) as aside:
         _write_places(aside, task, sure, start_ns, cloud, metres)
         if task.ways is not None:
             with written_aside(task.ways) as other:
                 _write_ways(other, task.ways.suffix, sure, start_ns, cloud, metres)
     return made
+
+
+def _why_none(path: Path) -> str:
+    """Why a cloud has nothing of the class, as far as the folder of its flight knows."""
+    beside = path.parent / QUALITY
+    try:
+        points = json.loads(beside.read_text(encoding="utf-8"))["points"]
+        classed, said = "classes" in points, warnings_in(points)
+    except (OSError, ValueError, KeyError, TypeError):
+        return "`swath process` gives it to what moved; clouds of other programs have nothing to tell it by"
+    if not classed:
+        return "its classes were not asked for; leave `--attributes` out, or name classes there"
+    if said:
+        return "; ".join(said)
+    return "no beam passed through a place where something was at another time; a place that was looked at once tells nothing"
 
 
 def _points(cloud: reader.Cloud, week: int | None, progress: Progress) -> tuple[npt.NDArray[np.int64], Array]:

@@ -109,16 +109,17 @@ class Found:
         if not self.stretches:
             return {}
         doubtful = [each.contradicted for each in self.stretches if not each.trusted]
-        note = (
+        warning = (
             f"in {len(doubtful)} of {len(self.stretches)} stretches of the flight beams pass through {max(doubtful):.1%} of the voxels at "
-            "another time, walls among them: the path does not come back to where it was, and nothing is classed as moving or mixed there"
+            "another time, walls among them: the path does not come back to where it was, and nothing is classed as moving or mixed there; "
+            "is the mount that of this flight (method adjusted estimates it, `swath calibrate` too), and do clocks and trajectory fit?"
             if doubtful
             else ""
         )
         return {
             "classes": {str(each): self.classes[each] for each in sorted(self.classes)},
             "mixed": self.mixed,
-            "note": note,
+            "warning": warning,
         }
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.radiometry.gains import Table
+from groundproc.radiometry.nearrange import BANDS, RangeGain, middle_m
 
 Array = npt.NDArray[np.float64]
 
@@ -61,20 +62,24 @@ class Patches:
     def __init__(self) -> None:
         self._lasers, self._strips = _Rows(2), _Rows(2)
 
-    def add(self, xyz_m: Array, strip: npt.NDArray[Any], strength: Array, freed: Array) -> None:
-        """Take echoes of strips: strengths as measured, and freed of range and incidence."""
-        self._strips.add(_cells(xyz_m), strip, strength, freed)
+    def add(
+        self, xyz_m: Array, strip: npt.NDArray[Any], strength: Array, freed: Array, band: npt.NDArray[np.int64]
+    ) -> None:
+        """Take echoes of strips: strengths as measured, and freed of range and incidence; with the band of their range."""
+        self._strips.add(_cells(xyz_m), strip.astype(np.int64) * BANDS + band, strength, freed)
 
-    def add_lasers(self, xyz_m: Array, laser: npt.NDArray[Any], incidence_rad: Array, freed: Array) -> None:
-        """Take single echoes from surfaces."""
+    def add_lasers(
+        self, xyz_m: Array, laser: npt.NDArray[Any], incidence_rad: Array, freed: Array, band: npt.NDArray[np.int64]
+    ) -> None:
+        """Take single echoes from surfaces, with the band of their range."""
         step = np.minimum(incidence_rad / _BIN_RAD, 31.0).astype(np.int64)
-        self._lasers.add(_cells(xyz_m) * 32 + step, laser, freed, freed**2)
+        self._lasers.add(_cells(xyz_m) * 32 + step, laser.astype(np.int64) * BANDS + band, freed, freed**2)
 
-    def table(self) -> Table:
-        """Strengths by patch and laser."""
+    def table(self) -> tuple[Table, npt.NDArray[np.int64]]:
+        """Strengths by patch, laser and band of range; and the band of each row."""
         rows = self._lasers.rows()
-        patch, laser, count = (rows[:, k].astype(np.int64) for k in range(3))
-        return Table(patch, laser, count, rows[:, 3], rows[:, 4])
+        patch, group, count = (rows[:, k].astype(np.int64) for k in range(3))
+        return Table(patch, group // BANDS, count, rows[:, 3], rows[:, 4]), group % BANDS
 
     def typical(self) -> float:
         """Median of the freed strengths of patches."""
@@ -82,9 +87,12 @@ class Patches:
         value = rows[:, 4] / rows[:, 2] if len(rows) else np.zeros(1)
         return float(np.median(value[value > 0])) if (value > 0).any() else 0.0
 
-    def strips(self) -> list[dict[str, Any]]:
-        """By how much each strip is brighter than the others where they overlap, before and after [percent]."""
-        rows = self._strips.rows()
+    def strips(self, by_range: RangeGain) -> list[dict[str, Any]]:
+        """By how much each strip is brighter than the others where they overlap, before and after [percent].
+
+        `..._percent` is the median of all patches, `..._cells_percent` the median of how far single ones are off.
+        """
+        rows = _by_strip(self._strips.rows(), by_range)
         rows = rows[rows[:, 2] >= _FEWEST]
         patch = np.unique(rows[:, 0], return_inverse=True)[1] if len(rows) else np.empty(0, np.int64)
         several = np.bincount(patch) if len(patch) else np.empty(0)
@@ -92,15 +100,26 @@ class Patches:
         for strip in np.unique(rows[:, 1]):
             own = (rows[:, 1] == strip) & (several[patch] > 1)
             one: dict[str, Any] = {"strip": int(strip), "patches": int(own.sum())}
-            for name, column in (("raw_percent", 3), ("reflectance_percent", 4)):
+            for name, column in (("raw", 3), ("reflectance", 4)):
                 mean = rows[:, column] / rows[:, 2]
                 others = (np.bincount(patch, mean) - 0.0)[patch] - mean
                 with np.errstate(divide="ignore", invalid="ignore"):
                     ratio = mean[own] / (others[own] / (several[patch[own]] - 1))
                 ratio = ratio[np.isfinite(ratio)]
-                one[name] = round(100.0 * (float(np.median(ratio)) - 1.0), 3) if len(ratio) else None
+                off = 100.0 * (ratio - 1.0)
+                one[f"{name}_percent"] = round(float(np.median(off)), 3) if len(off) else None
+                one[f"{name}_cells_percent"] = round(float(np.median(np.abs(off))), 3) if len(off) else None
             told.append(one)
         return told
+
+
+def _by_strip(rows: Array, by_range: RangeGain) -> Array:
+    """Rows by patch and strip, of those by patch, strip and band: freed of the gain by range."""
+    group = rows[:, 1].astype(np.int64)
+    gain, _ = by_range.at(middle_m(group % BANDS))
+    found, number = np.unique(np.column_stack([rows[:, 0], group // BANDS]), axis=0, return_inverse=True)
+    values = (rows[:, 2], rows[:, 3], rows[:, 4] / gain)
+    return np.column_stack([found, *(np.bincount(number.ravel(), each, len(found)) for each in values)])
 
 
 def _cells(xyz_m: Array) -> npt.NDArray[np.int64]:

@@ -21,6 +21,7 @@ def told(
     unused: Sequence[str],
     c_cal: tuple[float, float],
     relative: bool,
+    strips: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """The report: plain figures; c_cal with its sigma, gains, targets, strips before and after, warnings."""
     lasers = np.flatnonzero(gain.seen)
@@ -54,7 +55,7 @@ def told(
             {"id": c.id, "echoes": c.echoes, "c_cal": c.c_cal, "sigma": c.sigma, "incidence_deg": round(c.incidence_deg, 2)}
             for c in constants
         ],
-        "strips": site.patches.strips(),
+        "strips": strips,
         "points": {"all": site.survey.points, "on_surface": site.on_surface, "without_sensor": unknown},
         "warnings": warnings,
     }  # fmt: skip

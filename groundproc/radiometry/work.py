@@ -17,10 +17,11 @@ from groundproc.cloud.selection import CLASS, standing
 from groundproc.cloud.tiles import Found, Tile, Tiles, side_for
 from groundproc.files import made_folder, written_aside
 from groundproc.numerics import normals
-from groundproc.radiometry import report, signal
+from groundproc.radiometry import nearrange, report, signal
 from groundproc.radiometry.atmosphere import transmission
 from groundproc.radiometry.calibration import FEWEST, Constant, Echoes, combine, constant_of
-from groundproc.radiometry.gains import Gains, gains, speckle
+from groundproc.radiometry.gains import Gains, speckle
+from groundproc.radiometry.nearrange import RangeGain
 from groundproc.radiometry.sensorpath import Flown, Tally
 from groundproc.radiometry.site import STEEPEST, Progress, Sample, Site, Task, check_names, check_path, look
 from groundproc.radiometry.targets import Target
@@ -55,8 +56,8 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     site = look(task, progress)
     with made_folder(task.folder):
         found = _surfaces(site, progress)
-        told, gain, c_cal, sigma = _constants(site)
-        _write(site, found, gain, (c_cal, sigma), progress)
+        told, gain, by_range, c_cal, spread = _constants(site)
+        _write(site, found, (gain, by_range, spread), c_cal, progress)
         with written_aside(task.folder / REPORT) as aside:
             aside.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return told
@@ -143,10 +144,18 @@ def _gather(site: Site, xyz_m: Array, columns: dict[str, npt.NDArray[Any]], cosi
     surface = usable & np.isfinite(cosine)
     freed = strength * site.factor(range_m, np.where(surface, cosine, 1.0))
     single = usable & columns["single"]  # of a beam that meets several things, each echo has a part
-    site.patches.add(xyz_m[single], columns["strip"][single], strength[single], freed[single])
+    # only a sensor that takes out the range itself leaves something of it
+    band = nearrange.band(range_m) * (site.signal.kind == signal.COMPENSATED)
+    site.patches.add(xyz_m[single], columns["strip"][single], strength[single], freed[single], band[single])
     alone = surface & columns["single"] & (cosine > np.cos(np.deg2rad(70.0)))
     site.patches.add_lasers(
-        xyz_m[alone], columns["laser"][alone], np.arccos(np.minimum(cosine[alone], 1.0)), freed[alone]
+        xyz_m[alone],
+        columns["laser"][alone],
+        np.arccos(np.minimum(cosine[alone], 1.0)),
+        freed[alone],
+        nearrange.band(range_m[alone])
+        if site.signal.kind == signal.COMPENSATED
+        else np.zeros(int(alone.sum()), np.int64),
     )
     for number, target in enumerate(site.targets):
         west, south, east, north = target.polygon.bounds
@@ -158,14 +167,14 @@ def _gather(site: Site, xyz_m: Array, columns: dict[str, npt.NDArray[Any]], cosi
             site.echoes[number].append(np.column_stack(part))
 
 
-def _constants(site: Site) -> tuple[dict[str, Any], Gains, float, float]:
-    """Gains of lasers and c_cal, and the report."""
-    table = site.patches.table()
-    gain = gains(table)
+def _constants(site: Site) -> tuple[dict[str, Any], Gains, RangeGain, tuple[float, float], float]:
+    """The report, gains of lasers and by range, c_cal with its sigma, and the speckle of single echoes."""
+    table, of_band = site.patches.table()
+    gain, by_range = nearrange.both(table, of_band)
     constants: list[Constant] = []
     unused: list[str] = []
     for target, parts in zip(site.targets, site.echoes, strict=True):
-        one = constant_of(_echoes(site, target, np.concatenate(parts), gain)) if parts else None
+        one = constant_of(_echoes(site, target, np.concatenate(parts), gain, by_range)) if parts else None
         if one is None:
             unused.append(target.id)
         else:
@@ -179,16 +188,18 @@ def _constants(site: Site) -> tuple[dict[str, Any], Gains, float, float]:
         c_cal, sigma = combine(constants)
     else:
         c_cal, sigma = _without_targets(site), float("nan")
-    told = report.told(site, gain, constants, unused, (c_cal, sigma), relative)
-    told["speckle"] = round(speckle(table), 4)
-    return told, gain, c_cal, sigma
+    told = report.told(site, gain, constants, unused, (c_cal, sigma), relative, site.patches.strips(by_range))
+    spread = speckle(table)
+    told["speckle"], told["range_gains"] = round(spread, 4), by_range.tell()
+    return told, gain, by_range, (c_cal, sigma), spread
 
 
-def _echoes(site: Site, target: Target, rows: Array, gain: Gains) -> Echoes:
+def _echoes(site: Site, target: Target, rows: Array, gain: Gains, by_range: RangeGain) -> Echoes:
     strength, range_m, cosine, tilt, laser = rows.T
     angle = np.arccos(np.minimum(cosine, 1.0))
+    strength /= gain.gain[laser.astype(np.int64)] * by_range.at(range_m)[0]
     return Echoes(
-        target.id, strength / gain.gain[laser.astype(np.int64)], target.at(angle) / site.factor(range_m, cosine), angle, tilt,
+        target.id, strength, target.at(angle) / site.factor(range_m, cosine), angle, tilt,
         1.0 if site.signal.unit_db == 1.0 and site.signal.field == "intensity" else 0.0,
     )  # fmt: skip
 
@@ -202,10 +213,12 @@ def _without_targets(site: Site) -> float:
     return report.RELATIVE / max(site.patches.typical(), 1e-300)
 
 
-def _write(site: Site, found: Found, gain: Gains, c_cal: tuple[float, float], progress: Progress) -> None:
+def _write(
+    site: Site, found: Found, freed_of: tuple[Gains, RangeGain, float], c_cal: tuple[float, float], progress: Progress
+) -> None:
     """The clouds once more, with the reflectance of every echo."""
     start = 0
-    spread = speckle(site.patches.table())
+    gain, by_range, spread = freed_of
     constant = 0.0 if np.isnan(c_cal[1]) else c_cal[1] / c_cal[0]
     with ExitStack() as stack:
         for cloud in site.clouds:
@@ -219,15 +232,21 @@ def _write(site: Site, found: Found, gain: Gains, c_cal: tuple[float, float], pr
                     laser = chunk.points.columns.get("laser", np.zeros(count, np.uint8))
                     cosine = known["cosine"].astype(np.float64)
                     flat = np.isfinite(cosine)
+                    range_gain, range_sigma = by_range.at(known["range"].astype(np.float64))
                     freed = site.signal.linear(raw) * site.factor(
                         known["range"].astype(np.float64), np.where(flat, cosine, 1.0)
                     )
-                    value = np.where(site.good(raw), c_cal[0] * freed / gain.gain[laser], np.nan)
+                    value = np.where(site.good(raw), c_cal[0] * freed / gain.gain[laser] / range_gain, np.nan)
                     tan = np.sqrt(np.maximum(1.0 / np.maximum(np.where(flat, cosine, 1.0), STEEPEST) ** 2 - 1.0, 0.0))
                     tilt = np.where(flat, tan * np.nan_to_num(known["tilt"]), _LEAVES)
                     step = 0.2887 / np.maximum(raw, 0.5) if site.signal.field == "intensity" else 0.0
                     sigma = value * np.sqrt(
-                        constant**2 + spread**2 + tilt**2 + np.square(step) + gain.sigma[laser] ** 2 * flat
+                        constant**2
+                        + spread**2
+                        + tilt**2
+                        + np.square(step)
+                        + gain.sigma[laser] ** 2 * flat
+                        + (range_sigma / range_gain) ** 2
                     )
                     new.write(chunk.record, columns={"reflectance": value, "reflectance_sigma": sigma})
                     progress("writing", count)

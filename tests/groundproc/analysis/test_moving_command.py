@@ -123,6 +123,15 @@ def test_a_cloud_in_which_nothing_moved_says_so(tmp_path: Path, capsys: pytest.C
     assert main(["moving", str(cloud), "-o", str(tmp_path / "m.geojson")]) == 0
     assert "no point of class 69" in capsys.readouterr().err
     assert json.loads((tmp_path / "m.geojson").read_text())["features"] == []
+    # beside a flight's figures the reason is told
+    for points, said in (
+        ({"classes": {"1": 500}, "warning": "the path does not come back"}, "the path does not come back"),
+        ({"classes": {"1": 500}, "warning": ""}, "no beam passed through a place where something was at another time"),
+        ({"written": 500}, "its classes were not asked for"),
+    ):
+        (tmp_path / "quality.json").write_text(json.dumps({"points": points}))
+        assert main(["moving", str(cloud), "-o", str(tmp_path / "m.geojson"), "--force"]) == 0
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("words", "said"), [(("--every", "0"), "--every 0 s: expected"), ((), "no gps_time")])

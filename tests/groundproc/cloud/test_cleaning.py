@@ -15,6 +15,7 @@ from groundproc.cloud.pointsigma import MountErrors
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.model import Ranging
 from groundproc.trajectory.trajectory import Trajectory
+from groundproc.verdict import warnings_in
 
 Array = npt.NDArray[np.float64]
 
@@ -165,7 +166,7 @@ def test_people_who_walk_and_who_leave_are_a_class_of_their_own(
             who
         )  # what beams cannot pass below 0.6 m above the ground is left
     assert found.tell()["classes"][str(MOVING)] == (classes == MOVING).sum()
-    assert found.tell()["note"] == ""
+    assert found.tell()["warning"] == ""
 
 
 @pytest.mark.parametrize("what", [WIRE, MAST, FENCE, PANE, ROOM])
@@ -202,7 +203,10 @@ def test_a_path_that_comes_back_beside_itself_classes_nothing_as_moving(world: W
     made = described(replace(world.points, xyz_m=slipped), trajectory(1.0), found)
     assert not (made["classification"] == MOVING).any()
     assert not made["mixed"].any()
-    assert "does not come back to where it was" in found.tell()["note"]
+    # said at the end of `swath process`, as all that stands under `warning` is
+    (said,) = warnings_in({"points": found.tell()})
+    assert "does not come back to where it was" in said
+    assert "is the mount that of this flight" in said
 
 
 def test_an_echo_between_eaves_and_wall_is_mixed(world: World) -> None:

@@ -131,6 +131,43 @@ def test_amplitudes_are_freed_of_range_and_air(tmp_path: Path, visibility: float
         assert abs(each["reflectance_percent"]) < 0.2 * abs(each["raw_percent"])
 
 
+def defocused(range_m: Any, lost: float, near_m: float) -> Any:
+    """Share of the light that a receiver out of focus near by still gets: a law of another kind than the steps that are fitted."""
+    return 1.0 - lost * np.exp(-((range_m / near_m) ** 2))
+
+
+@pytest.mark.parametrize(("lost", "near_m"), [(0.45, 6.0), (0.25, 12.0)])
+def test_what_a_sensor_loses_near_by_is_found_from_strips_that_overlap(
+    tmp_path: Path, lost: float, near_m: float
+) -> None:
+    rng = np.random.default_rng(8)
+    made = scene(
+        gains=1.0 + 0.1 * rng.standard_normal(32),
+        response=lambda s, r: 80.0 * s * defocused(r, lost, near_m),
+        noise_m=0.02,
+    )
+    made.strips = [
+        Strip((-25.0, y, height), (2.5, 0, 0), 40.0 * n, 20)
+        for n, (y, height) in enumerate([(-2, 4.0), (3, 7.0), (-6, 12.0), (10, 20.0), (0, 35.0)])
+    ]
+    echoes = made.make(9)
+    found, told = run(tmp_path, made, echoes, "--targets", str(targets(tmp_path / "t.gpkg")))
+    raw = echoes["intensity"] / echoes["cosine"]
+    few = (echoes["range"] < 0.7 * near_m) & (echoes["surface"] == 0) & (echoes["cosine"] > 0.5)
+    assert np.median(raw[few] / echoes["rho"][few]) < 0.9 * 80.0
+    assert len(told["range_gains"]) > 5
+    for each in told["range_gains"]:
+        true = defocused(each["range_m"], lost, near_m)
+        assert abs(each["gain"] - true) < max(4 * each["sigma"], 0.03), each
+    assert worst(found, echoes) < 0.02
+
+
+def test_a_sensor_that_takes_out_the_range_gets_no_gain_by_range(tmp_path: Path) -> None:
+    made = scene(response=lambda s, r: 80.0 * s)
+    _, told = run(tmp_path, made, made.make(11), "--targets", str(targets(tmp_path / "t.gpkg")))
+    assert told["range_gains"] == []
+
+
 def test_reflectance_by_incidence_is_interpolated(tmp_path: Path) -> None:
     made = scene(response=lambda s, r: 80.0 * s)
     for surface in made.surfaces:
