@@ -79,7 +79,8 @@ class Bank:
         x, y = xy.T
         upper = self.upper_x(y)
         share = np.clip((x - upper) / self.width_m, 0.0, 1.0)
-        z = self.lower_z(y) + self.height_m * (1.0 - share) + np.where(x < upper, 0.03 * (self.land_x(y) - x), 0.0)
+        top = self.height_m + 0.03 * (self.land_x(y) - upper)
+        z = self.lower_z(y) + top * (1.0 - share) + np.where(x < upper, 0.03 * (upper - x), 0.0)
         return np.asarray(z - self.beach * np.maximum(x - self.beach_x(y), 0.0) + self._waves(xy))
 
     def _waves(self, xy: Array) -> Array:
