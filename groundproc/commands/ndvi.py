@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-HELP = "make NDVI or another index of images on the surface of a cloud, calibrated by panels where there are some"
+HELP = "make NDVI or another index of images on the surface of a cloud, calibrated by panels, irradiance or the lidar"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="CSV of surfaces of known reflectance: name,x,y,z,radius,red,green,blue,nir",
+    )
+    parser.add_argument(
+        "--reference",
+        metavar="NAME",
+        help="panels, irradiance (XMP of the pictures) or lidar (attribute reflectance of the cloud); default: the first there is",
     )
     parser.add_argument(
         "--cloud",
@@ -44,13 +49,15 @@ def run(arguments: argparse.Namespace) -> int:
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file, write_json
     from groundproc.geodesy import projected_crs
-    from groundproc.imagery.painting.indices import INDICES, Task, indices
+    from groundproc.imagery.painting.indices import INDICES, REFERENCES, Task, indices
     from groundproc.imagery.painting.ortho import SUFFIXES
 
     expect([arguments.cloud], CLOUD, CLOUD_WORDS)
     expect([arguments.panels], ("control", "table", "text"), "a table of panels (CSV)")
     if arguments.index not in INDICES:
         raise UsageError(f"--index {arguments.index!r}: expected one of {', '.join(INDICES)}")
+    if arguments.reference not in (None, *REFERENCES):
+        raise UsageError(f"--reference {arguments.reference!r}: expected one of {', '.join(REFERENCES)}")
     if arguments.draped is not None and arguments.index != "ndvi":
         raise UsageError(f"--cloud: points carry ndvi only, and --index is {arguments.index}; leave one of them out")
     claim_file(arguments.output, SUFFIXES, arguments.force, [arguments.cloud])
@@ -61,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     task = Task(
         arguments.cloud, arguments.images, arguments.output, arguments.gsd, arguments.index, arguments.panels,
         arguments.draped, arguments.photos, None if arguments.crs is None else projected_crs(arguments.crs),
+        arguments.reference,
     )  # fmt: skip
     with tqdm(unit="", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 
@@ -73,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"swath: warning: {line}", file=sys.stderr)
     if arguments.json is not None:
         write_json(arguments.json, made.figures())
-    by = f"by {max(line.panels for line in made.lines.values())} panels" if made.calibrated else "not calibrated"
+    by = made.by if made.calibrated else "not calibrated"
     print(
         f"{made.index} ({by}) of {made.columns} x {made.rows} pixels of {task.gsd_m:g} m in {task.output}: "
         f"{made.filled:,} have a value, median {made.median:.3f}"

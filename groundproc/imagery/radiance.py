@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CaptureError, UsageError
 from groundproc.imagery import pictures
+from groundproc.imagery.irradiance import rows, tags_of
 from groundproc.imagery.rig import RigCamera
 from groundproc.text import open_text, table_of
 
@@ -29,6 +30,7 @@ _LEAST_LIGHT: Final = 0.05
 TEMPERATURE: Final = "temperature"
 """The band of a thermal camera, whose numbers follow what it sees by a scale and an offset."""
 TRANSFERS: Final = ("linear", "srgb")
+PANELS: Final = "panels"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +65,15 @@ class Line:
         That it rests on; 0: nobody knows, and light stands for reflectance.
     rms : float
         Of what is left at the panels; not a number with fewer than three.
+    by : str
+        What it rests on: panels, irradiance or lidar; empty: nothing.
     """
 
     gain: float = 1.0
     offset: float = 0.0
     panels: int = 0
     rms: float = float("nan")
+    by: str = ""
 
 
 def light(path: Path, camera: RigCamera) -> npt.NDArray[np.float32]:
@@ -92,6 +97,8 @@ def light(path: Path, camera: RigCamera) -> npt.NDArray[np.float32]:
     if transfer == "srgb":
         numbers = _straight(numbers)
     numbers = (numbers - np.float32(black)) / vignetting(camera)[..., None] / np.float32(exposure(path))
+    more = rows(tags_of(path), shown.shape[0], exposed(path)[0])
+    numbers = numbers if more is None else numbers / more
     return numbers if unmix is None else np.asarray(numbers @ unmix.T.astype(np.float32))
 
 
@@ -199,6 +206,12 @@ def _of_powers(given: Mapping[str, Any], shape: tuple[int, int]) -> npt.NDArray[
 
 def exposure(path: Path) -> float:
     """Exposure time [s] x ISO / 100 / f-number^2 as EXIF has them; 1 for what it does not say."""
+    time_s, iso, stop = exposed(path)
+    return time_s * iso / 100.0 / stop**2
+
+
+def exposed(path: Path) -> tuple[float, float, float]:
+    """Exposure time [s], ISO and f-number; 1 s, 100 and 1 for what EXIF does not say."""
     found = _exif(path)
 
     def number(tag: int, otherwise: float) -> float:
@@ -209,7 +222,7 @@ def exposure(path: Path) -> float:
             return otherwise
         return value if np.isfinite(value) and value > 0.0 else otherwise
 
-    return number(_EXPOSURE_S, 1.0) * number(_ISO, 100.0) / 100.0 / number(_F_NUMBER, 1.0) ** 2
+    return number(_EXPOSURE_S, 1.0), number(_ISO, 100.0), number(_F_NUMBER, 1.0)
 
 
 def states_exposure(path: Path) -> bool:
@@ -268,9 +281,9 @@ def line(found: Array, known: Array) -> Line:
     if len(found) == 0:
         return Line()
     if len(found) == 1:
-        return Line(float(known[0] / found[0]), 0.0, 1)
+        return Line(float(known[0] / found[0]), 0.0, 1, by=PANELS)
     design = np.stack([found, np.ones(len(found))], axis=1)
     (gain, offset), *_ = np.linalg.lstsq(design, known, rcond=None)
     left = design @ np.array([gain, offset]) - known
     rms = float(np.sqrt((left**2).sum() / (len(found) - 2))) if len(found) > 2 else float("nan")
-    return Line(float(gain), float(offset), len(found), rms)
+    return Line(float(gain), float(offset), len(found), rms, PANELS)

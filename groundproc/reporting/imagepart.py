@@ -63,7 +63,10 @@ def _rows(told: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         name = max(by_image, key=lambda each: (by_image[each], each))
         yield "Most in one image", f"{by_image[name]:.1f} % ({name})"
     if "index" in ndvi:
-        how = ", ".join(f"{band}: {line['panels']} panels" for band, line in ndvi["lines"].items())
+        how = ", ".join(
+            f"{band}: {line['panels']} panels" if line["panels"] else f"{band}: {line['by'] or 'nothing'}"
+            for band, line in ndvi["lines"].items()
+        )
         yield (
             "Vegetation index",
             f"median {_number(ndvi['median'])}; {'calibrated' if ndvi['calibrated'] else 'not calibrated'} ({how})",

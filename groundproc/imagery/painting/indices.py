@@ -1,4 +1,7 @@
-"""Vegetation indices: mosaics of two bands as light, put on a scale of reflectance by panels, and their normalised difference."""
+"""Vegetation indices: mosaics of two bands as light, put on a scale of reflectance, and their normalised difference.
+
+The scale is that of panels, of the light on the ground as a sensor on the roof measured it, or of the lidar's own reflectance.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +16,10 @@ from flightlog.errors import UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
+from groundproc.imagery.irradiance import lit
+from groundproc.imagery.lidarreference import BY as BY_LIDAR
+from groundproc.imagery.lidarreference import GREY, GREY_SIGMA, NEAR
+from groundproc.imagery.lidarreference import lines as by_lidar
 from groundproc.imagery.painting.balance import gains
 from groundproc.imagery.painting.block import Block, Image, Layer
 from groundproc.imagery.painting.mosaic import Mosaic, mosaic
@@ -20,7 +27,7 @@ from groundproc.imagery.painting.ortho import Ground, balanced, ground
 from groundproc.imagery.painting.paint import paint, part, room
 from groundproc.imagery.painting.scene import mapped
 from groundproc.imagery.painting.views import NOBODY, blend
-from groundproc.imagery.radiance import Line, Panel, light, line, read_panels, states_exposure
+from groundproc.imagery.radiance import PANELS, Line, Panel, exposed, light, line, read_panels, states_exposure
 from groundproc.raster import geotiff
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Window
@@ -40,6 +47,11 @@ _BRIGHTEST: Final = 99.9
 """Percentile of light that counts as the full scale where exposures are compared."""
 _FEWEST: Final = 4
 """Pixels of a panel."""
+IRRADIANCE: Final = "irradiance"
+REFERENCES: Final = (PANELS, IRRADIANCE, BY_LIDAR)
+"""In the order in which they are taken."""
+REFLECTANCE: Final = "reflectance"
+"""Attribute of the points that `swath reflectance` gives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +69,8 @@ class Task:
         The cloud with the index of each point.
     photos : Path, optional
     crs : pyproj.CRS, optional
+    reference : str, optional
+        Of `REFERENCES`; default: the first that there is.
     """
 
     cloud: Path
@@ -68,6 +82,7 @@ class Task:
     draped: Path | None = None
     photos: Path | None = None
     crs: pyproj.CRS | None = None
+    reference: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +114,13 @@ class Made:
         """For programs."""
         return asdict(self)
 
+    @property
+    def by(self) -> str:
+        """What it is calibrated by, in words."""
+        names = " and ".join(dict.fromkeys(line.by for line in self.lines.values() if line.by))
+        panels = max(line.panels for line in self.lines.values())
+        return f"by {panels} panels" if names == PANELS else f"by {names}"
+
 
 @dataclass(frozen=True, slots=True)
 class _Source:
@@ -123,8 +145,9 @@ def indices(task: Task, progress: Progress) -> Made:
     upper, lower = INDICES[task.index]
     panels = [] if task.panels is None else read_panels(task.panels, (upper, lower))
     with ground(task.cloud, task.images, task.photos, task.crs, task.gsd_m, task.output, progress) as place:
-        sources = _sources(place, (upper, lower), progress)
-        lines, warnings = _lines(sources, panels)
+        roof = _roof([_layer_with(place.block, band) for band in (upper, lower)])
+        sources = _sources(place, (upper, lower), roof, progress)
+        lines, warnings, points = _referenced(task, place, sources, panels, roof, progress)
 
         def block(window: Window) -> Raster:
             a, b = (_reflectance(sources[band].window(window), lines[band]) for band in (upper, lower))
@@ -137,7 +160,8 @@ def indices(task: Task, progress: Progress) -> Made:
         found = np.concatenate([each[np.isfinite(each)] for each in values])
         failed = tuple(dict.fromkeys(name for source in sources.values() for name in source.mosaic.failed))
         if task.draped is not None:
-            _drape(task, place, sources, lines, progress)
+            points = points or _on_points(place, sources, roof, progress)
+            _drape(task, place, points, lines, progress)
         untimed = [
             ", ".join(each.bands)
             for each in {id(s.layer): s.layer for s in sources.values()}.values()
@@ -147,12 +171,7 @@ def indices(task: Task, progress: Progress) -> Made:
             f"images of {bands} do not say how long they were exposed (EXIF): they are brought to one exposure by what they share"
             for bands in untimed
         )
-        calibrated = all(each.panels for each in lines.values())
-        if not calibrated:
-            warnings = (
-                *warnings,
-                f"{task.index} is not calibrated: no panels, so bands are compared as the cameras have them",
-            )
+        calibrated = all(each.by for each in lines.values())
         median = float(np.median(found)) if len(found) else float("nan")
         return Made(
             task.index, place.grid.columns, place.grid.rows, len(found), calibrated, lines, median,
@@ -167,7 +186,76 @@ def normalised_difference(a: Raster, b: Raster) -> Raster:
         return np.where(a + b > 1e-9, (a - b) / (a + b), np.nan).astype(np.float32)
 
 
-def _sources(place: Ground, bands: Sequence[str], progress: Progress) -> dict[str, _Source]:
+@dataclass(frozen=True, slots=True)
+class _Roof:
+    """What the sensor on the roof says: by what the light of each picture is multiplied, and whether bands then compare."""
+
+    factor: Mapping[Path, float]
+    compares: bool
+
+
+def _roof(layers: Sequence[Layer]) -> _Roof:
+    """Of pictures that all say how they were exposed and how the ground was lit; else nothing."""
+    paths = [image.path for layer in {id(each): each for each in layers}.values() for image in layer.images]
+    said = [lit(path, *exposed(path)[:2]) if states_exposure(path) else None for path in paths]
+    known = [each for each in said if each is not None]
+    if not known or len(known) < len(paths):
+        return _Roof({}, False)
+    usual = float(np.median([each.irradiance for each in known]))
+    factor = np.array([each.factor for each in known])
+    compares = bool(np.isfinite(factor).all())
+    factor = factor / np.median(factor) if compares else np.ones(len(known))
+    share = [usual / each.irradiance for each in known]
+    return _Roof(dict(zip(paths, (factor * share).tolist(), strict=True)), compares)
+
+
+def _referenced(
+    task: Task, place: Ground, sources: Mapping[str, _Source], panels: Sequence[Panel], roof: _Roof, progress: Progress
+) -> tuple[dict[str, Line], tuple[str, ...], dict[str, Raster] | None]:
+    """The lines of the bands by the first reference that there is, what is to be said of it, and the light of points where it was needed.
+
+    Raises
+    ------
+    UsageError
+        There is none of the kind that is asked for.
+    """
+    asked = REFERENCES if task.reference is None else (task.reference,)
+    lines, warnings = _lines(sources, panels)
+    if PANELS in asked and all(each.by for each in lines.values()):
+        return lines, warnings, None
+    if IRRADIANCE in asked and roof.compares:
+        return {band: Line(by=IRRADIANCE) for band in sources}, warnings, None
+    if BY_LIDAR in asked and REFLECTANCE in place.cloud.columns and NEAR in sources:
+        points = _on_points(place, sources, roof, progress)
+        found = by_lidar({band: values.astype(np.float64) for band, values in points.items()}, _reflectances(place))
+        if found is not None:
+            others = " and ".join(band for band in found if band != NEAR)
+            told = (
+                f"{others} is put on the lidar's scale by the greyest ground, taken to reflect {GREY:g} of it (sigma {GREY_SIGMA:g}); "
+                "without any asphalt, concrete or gravel the index is too low"
+            )
+            return found, (*warnings, told), points
+    if task.reference is not None:
+        raise UsageError(f"--reference {task.reference}: {_LACKING[task.reference]}")
+    why = "no panels, no irradiance that compares between bands, no reflectance of the lidar"
+    told = f"{task.index} is not calibrated: {why}, so bands are compared as the cameras have them"
+    return lines, (*warnings, told), None
+
+
+_LACKING: Final = {
+    PANELS: "no panel is seen in both bands; expected --panels with some that images see",
+    IRRADIANCE: "the pictures do not say (XMP) both how the ground was lit and how the maker's bands compare, or not how they were exposed",
+    BY_LIDAR: "expected a cloud with reflectance (`swath reflectance`), and pictures with near infrared that see 200 points and more",
+}
+
+
+def _reflectances(place: Ground) -> npt.NDArray[np.float64]:
+    """The lidar's reflectance of all points, in the order of the file."""
+    parts = [chunk.points.columns[REFLECTANCE] for chunk in reader.chunks(place.cloud, columns=(REFLECTANCE,))]
+    return np.concatenate(parts).astype(np.float64)
+
+
+def _sources(place: Ground, bands: Sequence[str], roof: _Roof, progress: Progress) -> dict[str, _Source]:
     """Mosaics of light that hold the bands; one that holds both is made once."""
     made: dict[int, tuple[Mosaic, npt.NDArray[np.float32]]] = {}
     found = {}
@@ -179,7 +267,7 @@ def _sources(place: Ground, bands: Sequence[str], progress: Progress) -> dict[st
             bright = replace(layer, dtype=np.dtype(np.float32))
             laid = mosaic(
                 place.block, bright, place.scene, place.surface, place.grid, folder,
-                lambda n: progress("images", n), _loader(place.block),
+                lambda n: progress("images", n), _loader(place.block, roof),
             )  # fmt: skip
             made[id(layer)] = laid, _factors(layer, laid)
         found[band] = _Source(layer, made[id(layer)][0], layer.bands.index(band), made[id(layer)][1])
@@ -199,8 +287,11 @@ def _factors(layer: Layer, laid: Mosaic) -> npt.NDArray[np.float32]:
     return gains(laid.shared, len(layer.images), float(np.percentile(value[there], _BRIGHTEST)))
 
 
-def _loader(block: Block) -> Callable[[Image], npt.NDArray[Any]]:
-    return lambda image: light(image.path, block.rig.cameras[image.camera])
+def _loader(block: Block, roof: _Roof) -> Callable[[Image], npt.NDArray[Any]]:
+    def loaded(image: Image) -> npt.NDArray[Any]:
+        return light(image.path, block.rig.cameras[image.camera]) * np.float32(roof.factor.get(image.path, 1.0))
+
+    return loaded
 
 
 def _layer_with(block: Block, band: str) -> Layer:
@@ -260,22 +351,26 @@ def _reflectance(values: Raster, line: Line) -> Raster:
     return np.asarray(line.gain * values + line.offset, np.float32)
 
 
-def _drape(
-    task: Task, place: Ground, sources: Mapping[str, _Source], lines: Mapping[str, Line], progress: Progress
-) -> None:
-    """The cloud with the index of each point that images of both bands see."""
+def _on_points(place: Ground, sources: Mapping[str, _Source], roof: _Roof, progress: Progress) -> dict[str, Raster]:
+    """The light of each point by band, in the order of the file; NaN where no image sees."""
     bands: dict[str, Raster] = {}
     for band, source in sources.items():
-        layer = source.layer
-        bright = replace(layer, dtype=np.dtype(np.float32))
+        bright = replace(source.layer, dtype=np.dtype(np.float32))
         folder = place.folder / f"points_{band}"
         folder.mkdir()
         views = room(place.scene.size, bright, folder)
-        paint(place.block, bright, place.scene, views, lambda n: progress("points", n), _loader(place.block))
+        paint(place.block, bright, place.scene, views, lambda n: progress("points", n), _loader(place.block, roof))
         bands[band] = mapped(folder / "band", np.float32, (place.scene.size,))
         for square in place.scene.squares:
             values = blend(part(views, square.points), source.factor, 1.0, 1)[:, source.plane]
-            bands[band][place.scene.number[square.points]] = _reflectance(values, lines[band])
+            bands[band][place.scene.number[square.points]] = values
+    return bands
+
+
+def _drape(
+    task: Task, place: Ground, points: Mapping[str, Raster], lines: Mapping[str, Line], progress: Progress
+) -> None:
+    """The cloud with the index of each point that images of both bands see."""
     upper, lower = INDICES[task.index]
     assert task.draped is not None
     done = 0
@@ -285,5 +380,7 @@ def _drape(
     ):
         for chunk in reader.chunks(place.cloud, columns=()):
             some = slice(done, done + len(chunk.record))
-            new.write(chunk.record, columns={"ndvi": normalised_difference(bands[upper][some], bands[lower][some])})
+            a, b = (_reflectance(points[band][some], lines[band]) for band in (upper, lower))
+            new.write(chunk.record, columns={"ndvi": normalised_difference(a, b)})
             done = some.stop
+            progress("writing", len(chunk.record))

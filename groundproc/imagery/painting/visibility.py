@@ -37,6 +37,8 @@ _REACH: Final = 0.85
 """Radius of a disc in spacings: over the half that points keep from an edge, on average."""
 _CLOSED: Final = 1.7
 """Radius of the circles that fit into no gap, in spacings: with a disc's, points at random leave one gap in 300,000."""
+_LOOSE: Final = 0.5
+"""Of the circle's radius where leaves and edges are: light comes through what lies in no plane, but not between its neighbours."""
 _FINE: Final = 1.7
 """Pixels of the depth image that points stand apart."""
 ROLLS: Final = 3
@@ -138,6 +140,8 @@ class Depths:
         width, height = (int(np.ceil(side * self._scale)) + 1 for side in eye.size_px)
         self._near = np.zeros((height, width), np.float32)
         """One over the distance to the nearest point for each of its pixels [1/m]; 0 where there is none."""
+        self._loose = np.zeros((height, width), np.float32)
+        """The same of points that lie in no plane, until gaps are closed: between leaves there are gaps."""
         self._facing = np.zeros((height, width), np.float32)
         """Cosine of the angle between its ray and the normal of the plane there; 0 where nobody knows."""
         self._turning = _turning(eye) / self._scale
@@ -167,15 +171,21 @@ class Depths:
         place_m : ndarray, shape (3,)
             Projection centre in the frame of their coordinates.
         """
-        _splat(seen, surface, place_m, (self._scale, self._focal), self._turning, (self._near, self._facing))
+        depths = self._near, self._facing, self._loose
+        _splat(seen, surface, place_m, (self._scale, self._focal), self._turning, depths)
 
     def close(self) -> None:
-        """Close the gaps between all points, once they are in."""
-        radius = int(np.ceil(self._gap_px - 0.25))
+        """Close the gaps of surfaces, once all points are in; then lay over them what lies in no plane, and close finer gaps of all."""
+        self._close(self._gap_px)
+        if _lay_over(self._loose, self._near, self._facing):
+            self._close(self._gap_px * _LOOSE)
+
+    def _close(self, gap_px: float) -> None:
+        radius = int(np.ceil(gap_px - 0.25))
         if radius < 1:
             return
         down, right = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-        circle = (np.hypot(down, right) <= self._gap_px + 0.25).astype(np.uint8)
+        circle = (np.hypot(down, right) <= gap_px + 0.25).astype(np.uint8)
         # beyond its sides the picture goes on as it ends there; else slopes would be lifted along them
         rim = 2 * radius
         near = cv2.copyMakeBorder(self._near, rim, rim, rim, rim, cv2.BORDER_REPLICATE)
@@ -287,7 +297,7 @@ def _facing(normal: Any, way: Any, above: float, right: Any, below: Any) -> tupl
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any) -> None:
-    near, facing = depths
+    near, facing, loose = depths
     xyz, spacing, normals, above = surface.xyz_m, surface.spacing_m, surface.normal, surface.above_m
     number, pixel, ranges, shape = seen.number, seen.pixel, seen.range_m, near.shape
     scale, focal = scales
@@ -304,7 +314,7 @@ def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depth
             shape_ = plane[0], plane[1], plane[2], reach
             _disc(shape_, (way, right, below), (u, v, radius), (inverse, plane[3]), near, facing)
         else:
-            _round((u, v, radius), inverse, near, facing)
+            _round((u, v, radius), inverse, loose)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -314,7 +324,7 @@ def _sides(at: float, radius: float, size: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _round(at: Any, inverse: float, near: Any, facing: Any) -> None:
+def _round(at: Any, inverse: float, near: Any) -> None:
     """A disc that faces the camera, at least its own pixel."""
     u, v, radius = at
     top, bottom = _sides(v, radius, near.shape[0])
@@ -324,7 +334,17 @@ def _round(at: Any, inverse: float, near: Any, facing: Any) -> None:
             du, dv = column + 0.5 - u, row + 0.5 - v
             inside = du * du + dv * dv <= radius * radius or (row == int(v) and column == int(u))
             if inside and inverse > near[row, column]:
-                near[row, column], facing[row, column] = inverse, 0.0
+                near[row, column] = inverse
+
+
+@njit(cache=True, nogil=True)
+def _lay_over(loose: Any, near: Any, facing: Any) -> bool:
+    some = False
+    for row in range(near.shape[0]):
+        for column in range(near.shape[1]):
+            if loose[row, column] > near[row, column]:
+                near[row, column], facing[row, column], some = loose[row, column], 0.0, True
+    return some
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
