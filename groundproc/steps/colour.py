@@ -6,7 +6,7 @@ from typing import Any, Final
 from groundproc.steps import photographs
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE, Folders, Step
+from groundproc.steps.step import WHOLE, Folders
 
 CLOUD: Final = "cloud_colour.laz"
 OVERLAYS: Final = "overlays"
@@ -31,14 +31,4 @@ def work(run: Run, folders: Folders) -> None:
     photographs.tell(folder, STEP.name, made.figures() | {"warnings": list(made.left_out)})
 
 
-STEP: Final = Step(
-    name="colour",
-    about="the cloud in the colours of the photographs",
-    after=("place", "images"),
-    reads_logs=False,
-    settings=settings,
-    work=work,
-    files=photographs.files,
-    parts=photographs.parts,
-    reads=photographs.reads,
-)
+STEP: Final = photographs.step("colour", "the cloud in the colours of the photographs", settings, work)

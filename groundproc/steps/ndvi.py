@@ -7,7 +7,7 @@ from typing import Any, Final
 from groundproc.steps import photographs
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE, Folders, Step
+from groundproc.steps.step import WHOLE, Folders
 
 INDEX: Final = "ndvi"
 RASTER: Final = "ndvi.tif"
@@ -16,11 +16,6 @@ RASTER: Final = "ndvi.tif"
 def settings(request: Request) -> Mapping[str, Any]:
     """The size of a pixel, and the panels."""
     return {"ortho_gsd_m": request.survey.ortho_gsd_m, "panels": request.survey.panels}
-
-
-def files(request: Request) -> Mapping[str, Path]:
-    """The pictures, and the table of panels."""
-    return photographs.files(request, "panels")
 
 
 def work(run: Run, folders: Folders) -> None:
@@ -47,14 +42,6 @@ def work(run: Run, folders: Folders) -> None:
     photographs.tell(folder, STEP.name, told | {"warnings": [*made.left_out, *made.warnings]})
 
 
-STEP: Final = Step(
-    name="ndvi",
-    about="vegetation index, of photographs with near infrared and red",
-    after=("place", "images"),
-    reads_logs=False,
-    settings=settings,
-    work=work,
-    files=files,
-    parts=photographs.parts,
-    reads=photographs.reads,
+STEP: Final = photographs.step(
+    "ndvi", "vegetation index, of photographs with near infrared and red", settings, work, ("panels",)
 )

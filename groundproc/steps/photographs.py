@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +11,7 @@ from groundproc.products import chosen
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.request import Request
 from groundproc.steps.run import Run
-from groundproc.steps.step import WHOLE
+from groundproc.steps.step import WHOLE, Folders, Step
 
 BLOCK: Final = "block"
 """Folder of what step images leaves, within that of the flight: as `swath images` writes it."""
@@ -57,6 +57,17 @@ def files(request: Request, *named: str) -> dict[str, Path]:
     found = {f"image {path.absolute().relative_to(root).as_posix()}": path for path in pictures}
     given = {name: getattr(request.survey, name) for name in named}
     return found | {name: Path(path) for name, path in given.items() if path is not None}
+
+
+def step(
+    name: str, about: str, settings: Callable[[Request], Mapping[str, Any]], work: Callable[[Run, Folders], None],
+    named: Sequence[str] = (),
+) -> Step:  # fmt: skip
+    """A step that lays the adjusted photographs on the cloud; `named` settings are files that it reads too."""
+    return Step(
+        name=name, about=about, after=("place", "images"), reads_logs=False, settings=settings, work=work,
+        files=lambda request: files(request, *named), parts=parts, reads=reads,
+    )  # fmt: skip
 
 
 def check(request: Request) -> None:

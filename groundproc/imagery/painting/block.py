@@ -11,6 +11,8 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog.errors import CaptureError, UsageError
+from groundproc.cloud import reader
+from groundproc.cloud.selection import Choice
 from groundproc.imagery import pictures
 from groundproc.imagery.camera import Camera
 from groundproc.imagery.painting.visibility import Eye
@@ -95,6 +97,19 @@ class Block:
     site: Site
     layers: tuple[Layer, ...]
     left_out: tuple[str, ...]
+
+
+def of_cloud(
+    cloud: Path, images: Path, photos: Path | None, crs: pyproj.CRS | None, *choices: Choice
+) -> tuple[reader.Cloud, Block]:
+    """A cloud, or the points of it that are chosen, and the images of its place.
+
+    Raises
+    ------
+    UsageError, CaptureError, ConfigError
+    """
+    look = reader.look(cloud, *choices)
+    return look, load(images, photos, crs or look.horizontal, cloud)
 
 
 def load(folder: Path, photos: Path | None, crs: pyproj.CRS | None, cloud: Path) -> Block:

@@ -1,6 +1,5 @@
 """A cloud takes its colours from images: each point what the images that see it agree on, and nothing where none does."""
 
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,10 +15,10 @@ from groundproc.cloud.dimensions import TABLE, dimension
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.imagery.painting.balance import gains
-from groundproc.imagery.painting.block import COLOURS, Block, Layer, load
+from groundproc.imagery.painting.block import COLOURS, Block, Layer, of_cloud
 from groundproc.imagery.painting.overlay import overlays
 from groundproc.imagery.painting.paint import paint, part, room
-from groundproc.imagery.painting.scene import Scene, mapped
+from groundproc.imagery.painting.scene import Scene, laid_out, mapped
 from groundproc.imagery.painting.score import Score, score, worst
 from groundproc.imagery.painting.views import Views, blend
 from groundproc.imagery.radiance import TEMPERATURE
@@ -107,12 +106,9 @@ def colour(task: Task, progress: Progress) -> Made:
     ------
     CaptureError, ConfigError, UsageError, SourceError
     """
-    cloud = reader.look(task.cloud)
-    block = load(task.images, task.photos, task.crs or cloud.horizontal, task.cloud)
+    cloud, block = of_cloud(task.cloud, task.images, task.photos, task.crs)
     layers, unused = _layers(block)
-    with tempfile.TemporaryDirectory(prefix=".swath-colour-", dir=_beside(task.output)) as scratch:
-        folder = Path(scratch)
-        scene = Scene(cloud, block.site, folder, lambda n: progress("reading", n))
+    with laid_out(cloud, block.site, task.output, progress) as (scene, folder):
         seen = mapped(folder / "seen", np.uint8, (cloud.points,))
         laid = [_laid(task, block, layer, scene, folder / str(number), progress) for number, layer in enumerate(layers)]
         columns: dict[str, npt.NDArray[Any]] = {}
@@ -181,11 +177,6 @@ def _layers(block: Block) -> tuple[list[Layer], tuple[str, ...]]:
             chosen.append(layer)
             given |= set(layer.bands)
     return chosen, tuple(unused)
-
-
-def _beside(output: Path) -> Path:
-    """The nearest folder above the output that is there."""
-    return next(folder for folder in output.resolve().parents if folder.is_dir())
 
 
 def _columns(

@@ -1,7 +1,6 @@
 """The surface that the lidar saw as a mesh with the photographs on it."""
 
 import io
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,12 +11,11 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog.errors import CaptureError, UsageError
-from groundproc.cloud import reader
 from groundproc.cloud.selection import SURFACES
-from groundproc.imagery.painting.block import COLOURS, Block, Layer, load
+from groundproc.imagery.painting.block import COLOURS, Block, Layer, of_cloud
 from groundproc.imagery.painting.charts import Chart, charts
 from groundproc.imagery.painting.gltf import Piece, write_glb
-from groundproc.imagery.painting.scene import Scene
+from groundproc.imagery.painting.scene import Scene, laid_out
 from groundproc.imagery.painting.surface import surface_of
 from groundproc.imagery.painting.texture import textured
 from groundproc.imagery.painting.wavefront import write_obj
@@ -97,14 +95,10 @@ def mesh(task: Task, progress: Progress) -> Made:
     ------
     CaptureError, ConfigError, UsageError, SourceError
     """
-    cloud = reader.look(task.cloud, SURFACES)
+    cloud, block = of_cloud(task.cloud, task.images, task.photos, task.crs, SURFACES)
     crs = task.crs or cloud.horizontal
-    block = load(task.images, task.photos, crs, task.cloud)
     layer = _colours(block, task.images)
-    beside = next(folder for folder in task.output.resolve().parents if folder.is_dir())
-    with tempfile.TemporaryDirectory(prefix=".swath-mesh-", dir=beside) as scratch:
-        folder = Path(scratch)
-        scene = Scene(cloud, block.site, folder, lambda n: progress("reading", n))
+    with laid_out(cloud, block.site, task.output, progress) as (scene, folder):
         spacing_m = float(np.median([square.spacing_m for square in scene.squares]))
         surface = surface_of(cloud, spacing_m, task.cell_m or _FINEST_M)
         texel_m = task.texel_m or _pixel_m(block, layer, scene)

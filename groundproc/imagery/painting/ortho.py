@@ -1,6 +1,5 @@
 """Ortho mosaics: the ground as it lies on the map, from many images, on the surface that the lidar saw."""
 
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,9 +15,9 @@ from groundproc.cloud import reader
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.imagery.painting.balance import gains
-from groundproc.imagery.painting.block import COLOURS, Block, Layer, load
+from groundproc.imagery.painting.block import COLOURS, Block, Layer, of_cloud
 from groundproc.imagery.painting.mosaic import Mosaic, mosaic
-from groundproc.imagery.painting.scene import Scene
+from groundproc.imagery.painting.scene import Scene, laid_out
 from groundproc.imagery.painting.surface import Surface, surface_of
 from groundproc.imagery.painting.views import NOBODY
 from groundproc.raster import geotiff
@@ -110,12 +109,8 @@ def ground(
 ) -> Iterator[Ground]:
     """Get ready for mosaics with pixels of a size; the scratch folder lies beside the output, and goes when this is left."""
     checked_cell(gsd_m)
-    look = reader.look(cloud)
-    block = load(images, photos, crs or look.horizontal, cloud)
-    place = next(folder for folder in beside.resolve().parents if folder.is_dir())
-    with tempfile.TemporaryDirectory(prefix=".swath-ortho-", dir=place) as scratch:
-        folder = Path(scratch)
-        scene = Scene(look, block.site, folder, lambda n: progress("reading", n))
+    look, block = of_cloud(cloud, images, photos, crs)
+    with laid_out(look, block.site, beside, progress) as (scene, folder):
         spacing_m = float(np.median([square.spacing_m for square in scene.squares]))
         surface = surface_of(reader.look(cloud, SURFACES), spacing_m, gsd_m)
         yield Ground(look, block, scene, surface, _fine(surface.grid, gsd_m), folder)

@@ -3,9 +3,11 @@
 It lies on the disk and is mapped, so that clouds of any size can be looked at from any side, square by square.
 """
 
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
@@ -138,6 +140,16 @@ class Scene:
             self._rough_m[points],
             self._above_m[points],
         )
+
+
+@contextmanager
+def laid_out(
+    cloud: reader.Cloud, site: Site, output: Path, progress: Callable[[str, int], object]
+) -> Iterator[tuple[Scene, Path]]:
+    """A cloud as images look at it, and the scratch folder that it lies in: beside the output, and gone when this is left."""
+    beside = next(folder for folder in output.resolve().parents if folder.is_dir())
+    with tempfile.TemporaryDirectory(prefix=".swath-images-", dir=beside) as scratch:
+        yield Scene(cloud, site, Path(scratch), lambda count: progress("reading", count)), Path(scratch)
 
 
 def _order(local: Array) -> tuple[npt.NDArray[np.int32], int]:

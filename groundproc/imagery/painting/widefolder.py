@@ -1,6 +1,5 @@
 """`swath wide` as a whole: instants found, their wide images written with poses and the camera that stands for the rig."""
 
-import tempfile
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,11 +11,10 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog.errors import CaptureError, UsageError
-from groundproc.cloud import reader
 from groundproc.files import make_folder, written_aside
 from groundproc.imagery import pictures
-from groundproc.imagery.painting.block import POSES, RIG, Block, Image, load
-from groundproc.imagery.painting.scene import Scene
+from groundproc.imagery.painting.block import POSES, RIG, Block, Image, of_cloud
+from groundproc.imagery.painting.scene import laid_out
 from groundproc.imagery.painting.wide import Instant, Wide, instants, merged, posed, wide_of
 from groundproc.imagery.poses import NO_TIME, ImagePoses, read_poses, write_poses
 from groundproc.imagery.radiance import evened
@@ -101,8 +99,7 @@ def wide(task: Task, progress: Progress) -> Made:
     ------
     CaptureError, ConfigError, UsageError, SourceError
     """
-    cloud = reader.look(task.cloud)
-    block = load(task.images, task.photos, task.crs or cloud.horizontal, task.cloud)
+    cloud, block = of_cloud(task.cloud, task.images, task.photos, task.crs)
     found, alone = _instants(task, block)
     stands = wide_of(block, found)
     kinds = {image.name: layer for layer in block.layers for image in layer.images}
@@ -119,8 +116,7 @@ def wide(task: Task, progress: Progress) -> Made:
     done: list[Instant] = []
     failed: list[str] = []
     filled = 0.0
-    with tempfile.TemporaryDirectory(prefix=".swath-wide-", dir=task.output) as scratch:
-        scene = Scene(cloud, block.site, Path(scratch), lambda n: progress("reading", n))
+    with laid_out(cloud, block.site, task.output, progress) as (scene, _):
         for number, instant in enumerate(found, 1):
             try:
                 values = merged(block, scene, stands, instant, bands, shown, task.balance)
