@@ -19,7 +19,7 @@ from flightlog.mount import LidarMount, Mount
 from groundproc.accuracy.truth import read_truth
 from groundproc.cli import main
 from groundproc.cloud.pointsigma import LARGEST_M, Errors, MountErrors
-from groundproc.estimation.ins import UERE_M
+from groundproc.estimation.ownsolution import UERE_M
 from groundproc.geodesy import LocalFrame
 from groundproc.numerics.robust import sigma
 from groundproc.sensors.model import Ranging
