@@ -1,6 +1,5 @@
 """Several clouds in one file: every point as it was, with attributes more, in the order of the clouds."""
 
-import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -10,10 +9,9 @@ import laspy
 import numpy as np
 import numpy.typing as npt
 
-from flightlog.errors import SourceError
 from groundproc.cloud.layout import Layout
 from groundproc.cloud.reader import Cloud
-from groundproc.cloud.storing import storing
+from groundproc.cloud.storing import begun, ended, storing
 
 
 class Merger:
@@ -40,16 +38,7 @@ class Merger:
     def __init__(self, clouds: Sequence[Cloud], path: Path, added: Iterable[str]) -> None:
         self._path, self._layout = path, Layout(clouds, added)
         self._records: Sequence[laspy.VLR] = ()
-        try:
-            self._las = laspy.open(
-                path,
-                mode="w",
-                header=self._layout.header(),
-                laz_backend=laspy.LazBackend.LazrsParallel,
-                do_compress=True,
-            )
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be written ({error.strerror})") from None
+        self._las = begun(path, self._layout.header())
 
     def __enter__(self) -> Self:
         return self
@@ -57,14 +46,7 @@ class Merger:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is not None:
-            with contextlib.suppress(OSError):
-                self._las.dest.close()
-            return
-        with storing(self._path):
-            if self._records:
-                self._las.write_evlrs(laspy.vlrs.vlrlist.VLRList(self._records))
-            self._las.close()
+        ended(self._las, self._path, error is not None, self._records)
 
     def close_with(self, records: Sequence[laspy.VLR]) -> None:
         """What is to stand behind the points when all is written."""

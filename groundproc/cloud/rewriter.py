@@ -1,6 +1,5 @@
 """A cloud written anew: same points, attributes, order, header and records, other coordinates, or more attributes."""
 
-import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,11 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog import __version__
-from flightlog.errors import CaptureError, SourceError
+from flightlog.errors import CaptureError
 from groundproc.cloud.dimensions import Dimension, in_order
 from groundproc.cloud.packer import extra_bytes
 from groundproc.cloud.reader import Cloud, opened
-from groundproc.cloud.storing import storing
+from groundproc.cloud.storing import begun, ended, storing
 
 Array = npt.NDArray[np.float64]
 
@@ -106,12 +105,7 @@ class Rewriter:
                     header.add_crs(frame.crs, keep_compatibility=False)
             self._scales, self._offsets = np.array(header.scales), np.array(header.offsets)
             self._evlrs = [v for v in (reader.evlrs or []) if v.user_id not in _NOT_KEPT]
-        try:
-            self._las = laspy.open(
-                path, mode="w", header=header, laz_backend=laspy.LazBackend.LazrsParallel, do_compress=compressed
-            )
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be written ({error.strerror})") from None
+        self._las = begun(path, header, compressed)
 
     def __enter__(self) -> Self:
         return self
@@ -119,14 +113,7 @@ class Rewriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is not None:  # nothing of it is kept: what closing would still write may fail for the same reason
-            with contextlib.suppress(OSError):
-                self._las.dest.close()
-            return
-        with storing(self.path):
-            if self._evlrs:
-                self._las.write_evlrs(laspy.vlrs.vlrlist.VLRList(self._evlrs))
-            self._las.close()
+        ended(self._las, self.path, error is not None, self._evlrs)
 
     def write(
         self, record: Any, moved_m: Array | None = None, columns: Mapping[str, npt.NDArray[Any]] | None = None

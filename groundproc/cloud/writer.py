@@ -1,6 +1,5 @@
 """Clouds as LAZ, compressed on all cores."""
 
-import contextlib
 import queue
 import threading
 from collections.abc import Iterable, Sequence
@@ -13,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 
-from flightlog.errors import SourceError
 from groundproc.cloud.packer import Packer
 from groundproc.cloud.points import Points
-from groundproc.cloud.storing import storing
+from groundproc.cloud.storing import begun, ended, storing
 from groundproc.system import cores
 
 BUFFER_POINTS: Final = min(max(5 * cores(), 5), 20) * 50_000
@@ -62,12 +60,7 @@ class CloudWriter:
     ) -> None:
         self._path = path
         self._packer = Packer(path, columns, crs=crs, offset_m=offset_m, gps=gps, about=about)
-        try:
-            self._las = laspy.open(
-                path, mode="w", header=self._packer.header, laz_backend=laspy.LazBackend.LazrsParallel, do_compress=True
-            )
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be written ({error.strerror})") from None
+        self._las = begun(path, self._packer.header)
         self._filling, self._used = np.zeros(BUFFER_POINTS, self._packer.dtype), 0
         self._full: queue.SimpleQueue[npt.NDArray[np.void] | None] = queue.SimpleQueue()
         self._free: queue.SimpleQueue[npt.NDArray[np.void]] = queue.SimpleQueue()
@@ -88,11 +81,7 @@ class CloudWriter:
         self._thread.join()
         if self._error is None:
             self._packer.state_totals(self._las.header)
-            with storing(self._path):
-                self._las.close()
-        else:
-            with contextlib.suppress(OSError):  # on a full disk closing fails as well
-                self._las.dest.close()
+        ended(self._las, self._path, self._error is not None)
         if self._error is not None and error is None:
             raise self._error
 
