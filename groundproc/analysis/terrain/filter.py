@@ -7,28 +7,27 @@ on a plain. And the threshold follows the ground's own relief at each place, its
 quarry an edge of a metre is ground, on a lawn it is none.
 """
 
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.ndimage import uniform_filter
 
+from groundproc.analysis.terrain.pits import amid, narrow_pits, pulling
+from groundproc.analysis.terrain.reach import reach_of, slope_of
 from groundproc.analysis.terrain.settings import Settings, radii
 from groundproc.raster.fill import fill
 from groundproc.raster.openings import opened
 
 Raster = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+Threshold = Raster | np.float32
 
-_PIT_M: Final = 2.0
-"""A lowest point that lies so far below those around it, and that fewer than ..."""
-_PIT_FELLOWS: Final = 3
-"""... so many other cells within ..."""
-_PIT_AROUND_M: Final = 5.0
-"""... this distance come near, is an error of ranging or an echo by way of a mirror. In a wood ground seen through one gap has fellows."""
 _BOXES: Final = 3
 """Boxes one after the other are a bell to 3 %."""
+_TRIES: Final = 3
+"""Pits that gain nothing are taken back so often; then all are."""
 
 
 class Bare(NamedTuple):
@@ -61,55 +60,65 @@ def bare_ground(lowest_m: Raster, settings: Settings) -> Bare:
         Height of the lowest point of each cell; NaN without any. At least one is known.
     settings : Settings
     """
-    cell_m = settings.cell_m
-    known = np.isfinite(lowest_m)
-    surface = fill(lowest_m)
-    pit = known & (opened(-surface, 1) < -surface - np.float32(_PIT_M))
-    _keep_alone(pit, np.where(known, lowest_m, np.float32(np.inf)), max(round(_PIT_AROUND_M / cell_m), 2))
-    known &= ~pit
-    surface = fill(np.where(known, lowest_m, np.float32(np.nan)))
-    lengths = [(radius, radius * cell_m) for radius in radii(settings.window_m, cell_m)]
-
-    objects = np.zeros(known.shape, np.bool_)
-    opened_m = surface
-    for radius, length_m in lengths:
-        opened_m = _level(opened_m, radius, objects, np.float32(settings.step_m + settings.slope * length_m))
-    ground = known & ~objects
+    narrow, pit = narrow_pits(lowest_m, settings.cell_m)
+    known = np.isfinite(lowest_m) & ~pit
+    surface, pulls, objects = _first(lowest_m, known, narrow & known, settings)
+    ground = known & ~objects & ~pulls
     height = _without(surface, ground)
 
-    sigma = settings.smoothing_m / cell_m
+    sigma = settings.smoothing_m / settings.cell_m
     smooth = smoothed(height, sigma)
     deviation = np.where(ground, (surface - smooth) ** 2, np.float32(0.0))
     share = smoothed(ground.astype(np.float32), sigma)
     relief = np.sqrt(np.maximum(smoothed(deviation, sigma), 0.0) / (np.maximum(share, 0.0) + np.float32(1e-3)))
     base = np.float32(settings.step_m) + np.float32(settings.relief) * relief
-    rise = np.float32(settings.slope) + np.float32(settings.steepness) * slope_of(smooth, cell_m)
-    objects[:] = False
-    opened_m = surface - smooth
-    for radius, length_m in lengths:
-        opened_m = _level(opened_m, radius, objects, base + rise * np.float32(length_m))
-    ground = known & ~objects
-    height = _without(surface, ground)
-    reach = np.float32(settings.height_m) + np.float32(settings.slack) * slope_of(height, cell_m)
-    return Bare(height, reach, ground, pit)
+    rise = np.float32(settings.slope) + np.float32(settings.steepness) * slope_of(smooth, settings.cell_m)
+    ground = known & (~_objects(surface - smooth, base, rise, settings) | pulls)
+    height = _without(np.where(pulls, lowest_m, surface), ground)
+    return Bare(height, reach_of(height, settings), ground, pit)
 
 
-@njit(cache=True, nogil=True)
-def _keep_alone(pit: Any, lowest: Any, half: int) -> None:
-    """Take back pits that have fellows within a square of that half side."""
-    rows, columns = pit.shape
-    for i in range(rows):
-        for j in range(columns):
-            if not pit[i, j]:
-                continue
-            below, fellows = lowest[i, j] + _PIT_M, -1
-            for a in range(max(i - half, 0), min(i + half + 1, rows)):
-                for b in range(max(j - half, 0), min(j + half + 1, columns)):
-                    fellows += lowest[a, b] < below
-            pit[i, j] = fellows < _PIT_FELLOWS
+def _first(lowest: Raster, known: Mask, narrow: Mask, settings: Settings) -> tuple[Raster, Mask, Mask]:
+    """The lowest points, filled and with pits bridged that pull their surroundings down; these pits; and what stands on that."""
+    step, slope = np.float32(settings.step_m), np.float32(settings.slope)
+    surface = _filled(lowest, known)
+    objects = _objects(surface, step, slope, settings)
+    if not narrow.any():
+        return surface, narrow, objects
+    without = _growing(_filled(lowest, known & ~narrow), step, slope, settings)
+    pulls, gained = pulling(surface, narrow, known, objects, without, settings)
+    for _ in range(_TRIES):
+        if not pulls.any():
+            break
+        bridged = _filled(lowest, known & ~pulls)
+        left = _objects(bridged, step, slope, settings)
+        # where others hold the ground down as well, half a remedy is none
+        kept = amid(pulls, gained & ~left, gained, settings)
+        if np.array_equal(kept, pulls):
+            return bridged, pulls, left
+        pulls = kept
+    return surface, np.zeros_like(known), objects
 
 
-def _level(surface: Raster, radius: int, objects: Mask, threshold: Raster | np.float32) -> Raster:
+def _objects(surface: Raster, step: Threshold, slope: Threshold, settings: Settings) -> Mask:
+    """What stands above openings of growing radius r by more than step + slope r."""
+    *_, objects = _growing(surface, step, slope, settings)
+    return objects
+
+
+def _growing(surface: Raster, step: Threshold, slope: Threshold, settings: Settings) -> Iterator[Mask]:
+    """What stands above them after each opening, in one array."""
+    objects = np.zeros(surface.shape, np.bool_)
+    for radius in radii(settings.window_m, settings.cell_m):
+        surface = _level(surface, radius, objects, step + slope * np.float32(radius * settings.cell_m))
+        yield objects
+
+
+def _filled(lowest: Raster, known: Mask) -> Raster:
+    return fill(np.where(known, lowest, np.float32(np.nan)))
+
+
+def _level(surface: Raster, radius: int, objects: Mask, threshold: Threshold) -> Raster:
     """Open a surface, and mark what stands above it by more than a threshold."""
     low = opened(surface, radius)
     objects |= surface - low > threshold
@@ -120,7 +129,7 @@ def _without(surface: Raster, ground: Mask) -> Raster:
     """The surface with all that is no ground filled from what is; the surface itself where nothing is."""
     if not ground.any():
         return surface
-    return fill(np.where(ground, surface, np.float32(np.nan)))
+    return _filled(surface, ground)
 
 
 def smoothed(values: Raster, sigma: float) -> Raster:
@@ -129,11 +138,3 @@ def smoothed(values: Raster, sigma: float) -> Raster:
     for _ in range(_BOXES):
         values = uniform_filter(values, width, mode="nearest")
     return values
-
-
-def slope_of(height_m: Raster, cell_m: float) -> Raster:
-    """Rise over run of a raster of heights."""
-    if min(height_m.shape) < 2:
-        return np.zeros_like(height_m)
-    down, right = np.gradient(height_m, np.float32(cell_m))
-    return np.asarray(np.hypot(down, right), np.float32)
