@@ -23,7 +23,7 @@ from groundproc.estimation.adjustment.batch import DRAWS, add_world, corrected, 
 from groundproc.estimation.adjustment.noise import noise_of
 from groundproc.estimation.adjustment.patches import Patches, coarse
 from groundproc.estimation.adjustment.poses import pose_errors
-from groundproc.estimation.adjustment.posterior import Posterior, Spread, datum_of
+from groundproc.estimation.adjustment.posterior import Posterior, Spread
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.observations.lidar import DEFLATION
 from groundproc.estimation.observations.observation import Observation, State
@@ -143,7 +143,7 @@ class Joining:
         for voxel_m, cut in ROUNDS:
             last = self.step(voxel_m, cut)
         last = self._hold(last)
-        return self._joined(last.unknowns, last.spread(DRAWS))
+        return self._joined(last.unknowns, last.spread(DRAWS), last.datum())
 
     def _hold(self, last: Posterior) -> Posterior:
         """Where some observation lays the flight, which is right in itself, as a whole elsewhere: adjust it with that."""
@@ -191,7 +191,7 @@ class Joining:
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(self.path.position_m - before.position_m).sum(axis=1).mean()))
         return Posterior(linear, unknowns, lambda: noise_of(rows, seen.clusters, before, DEFLATION, factors, x))
 
-    def _joined(self, unknowns: Unknowns, spread: Spread) -> "Joined":
+    def _joined(self, unknowns: Unknowns, spread: Spread, datum: Array) -> "Joined":
         """The correction, and its sigmas."""
         knots = slice(None, None, STEPS)
         mats, place = frames.mat_from_quat(self.path.quat[knots]), self.path.position_m[knots]
@@ -222,7 +222,6 @@ class Joining:
             if not name.startswith("world.")
         }
         told = told_by(self.observations, self.state())
-        datum = datum_of(spread, unknowns)
         return Joined(self.begin, self.path, sigmas[0], sigmas[1], found, self.log, told, correlation, datum)
 
 

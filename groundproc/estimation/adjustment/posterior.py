@@ -148,6 +148,13 @@ class Posterior:
             seen.append(self.noise.seen(self.problem.solve(right, 0.0, ENOUGH_OF_COLUMNS)[0]))
         return np.asarray(np.array(seen) @ np.array(seen).T)
 
+    def datum(self) -> Array:
+        """Covariance of the shift and of the turn about the origin that all of a path shares, shape (6, 6).
+
+        Where the whole lies is the anchors' part, but how it leans is told by accelerometers, whose errors are none of theirs.
+        """
+        return self.covariance(("world.shift", "world.turn"))
+
     def weighed(self, names: Sequence[str]) -> Array:
         """Covariance of some globals were the rows' weights right, shape (m, m): columns of the normal matrix's inverse."""
         places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
@@ -159,19 +166,6 @@ class Posterior:
             right[place] = 1.0 / prior[i]
             columns[i] = self.problem.solve(right, EXACT)[0][places] * prior[i]
         return np.asarray(0.5 * (columns + columns.T))
-
-
-def datum_of(spread: Spread, unknowns: Unknowns) -> Array:
-    """Covariance of the shift and of the turn about the origin that all of a path shares, shape (6, 6).
-
-    It is the anchors' part, which needs no draws; where control holds the whole there is none, and draws tell.
-    """
-    where = np.concatenate(
-        [np.arange(unknowns.names[n].start, unknowns.names[n].stop) for n in ("world.shift", "world.turn")]
-    )
-    if len(spread.columns):
-        return np.asarray(spread.columns[:, where].T @ spread.columns[:, where])
-    return np.asarray(spread.whole[:, where].T @ spread.whole[:, where] / len(spread.whole))
 
 
 def whole_covariance(posterior: Posterior, path: Path) -> Array:

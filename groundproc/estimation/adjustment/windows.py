@@ -16,7 +16,7 @@ from groundproc.estimation.adjustment.batch import DRAWS, Batch
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
 from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
-from groundproc.estimation.adjustment.posterior import Posterior, Spread, datum_of, joined
+from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
 from groundproc.estimation.observations import lasers
 from groundproc.estimation.observations.inertial import carried_density, gyro_readings
 from groundproc.estimation.observations.lidar import Lidar
@@ -181,7 +181,6 @@ def adjust_window(
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
     spread = posterior.spread(DRAWS)
-    datum = datum_of(spread, posterior.unknowns)
     unknowns = batch.unknowns()
     (values, exact), seen = _values(unknowns, posterior, spread, sources.exact), None
     if before or more:
@@ -198,7 +197,7 @@ def adjust_window(
     return Window(
         first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
         batch.log, exact, corrections, batch.said(), seen, errors.correlation,
-        carried_density(observations, motion.rate_density), datum,
+        carried_density(observations, motion.rate_density), posterior.datum(),
     )  # fmt: skip
 
 

@@ -109,6 +109,11 @@ def test_the_covariance_is_the_dense_sandwich(posed: tuple[Problem, Noise], unkn
     found = posterior.covariance(names)
     scale = np.sqrt(np.diag(dense)[at])
     np.testing.assert_allclose(found / np.outer(scale, scale), dense[at, at] / np.outer(scale, scale), atol=0.01)
+    # what all poses share: the shift before the turn, and more of it than what says where the whole lies knows of
+    order = [3, 4, 5, 0, 1, 2]
+    np.testing.assert_allclose(posterior.datum()[np.ix_(order, order)], found, rtol=1e-9)
+    anchored = told @ inverse @ noise.anchors.T
+    assert (np.diag(found) > np.square(anchored[at]).sum(axis=1)).all()
     # and the path's: where the whole lies is not drawn and right to a few per cent, its shape to what 40 draws tell
     spread = posterior.spread(40)
 

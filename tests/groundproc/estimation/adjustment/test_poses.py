@@ -11,7 +11,7 @@ from flightlog import frames
 from flightlog.mount import Mount
 from groundproc.estimation.adjustment import windows
 from groundproc.estimation.adjustment.poses import pose_errors, semidefinite
-from groundproc.estimation.adjustment.posterior import Spread, datum_of
+from groundproc.estimation.adjustment.posterior import Spread
 from groundproc.estimation.adjustment.run import Run
 from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
@@ -174,15 +174,3 @@ def test_windows_that_are_joined_add_what_the_joining_does_not_know() -> None:
     np.testing.assert_array_equal(made.correlation.time_ns, knots)
     # what windows do not know of where they lie is the joining's
     np.testing.assert_array_equal(made.datum, joined.datum)
-
-
-def test_the_datum_is_the_part_of_the_anchors(unknowns: Unknowns) -> None:
-    """Columns for where the whole lies, and draws that add what only bends the path: the datum is theirs, shift before turn."""
-    rng = np.random.default_rng(2)
-    columns = rng.standard_normal((5, unknowns.size))
-    turn, shift = (columns[:, unknowns.names[name]] for name in ("world.turn", "world.shift"))
-    whole = np.concatenate([shift, turn], axis=1)
-    np.testing.assert_allclose(datum_of(only_known(columns), unknowns), whole.T @ whole)
-    drawn = rng.standard_normal((4000, unknowns.size))
-    of_draws = datum_of(Spread(drawn, 0.0 * drawn, np.zeros((0, unknowns.size))), unknowns)
-    np.testing.assert_allclose(of_draws, np.eye(6), atol=0.1)
