@@ -104,7 +104,10 @@ def test_a_trajectory_that_lies_alone_is_taken_with_the_mount_of_the_log_and_tha
 ) -> None:
     """What the folder is for: without it points move by decimetres."""
     shutil.copy(direct / "trajectory.csv", tmp_path / "trajectory.csv")
-    alone = again(flight.log, tmp_path / "out", tmp_path / "trajectory.csv")
+    # doubtful: by a mount that is decimetres off the beams of one pass go through the points of another
+    words = ["--trajectory", str(tmp_path / "trajectory.csv"), "--products", "cloud.laz", "-o", str(tmp_path / "out")]
+    assert main(["process", str(flight.log), *words]) == 3
+    alone = tmp_path / "out"
     moved = np.linalg.norm(points(alone) - points(direct), axis=1)
     assert np.median(moved) > 0.02
     assert quality(alone)["mount"]["source"] == "log"
