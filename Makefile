@@ -18,9 +18,8 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/pytest
-# A file of tests stays on one worker, so that what its fixtures made is made once. Two workers more than cores: those that wait,
-# for a daemon, a silence or the time of a flight, leave their core to others.
-PARALLEL := -n $(shell expr $$(nproc) + 2) --dist loadfile
+# A file of tests stays on one worker, so that what its fixtures made is made once.
+PARALLEL := -n auto --dist loadfile
 
 .PHONY: setup demo test check soak bench docs deb release clean
 

@@ -31,8 +31,11 @@ def test_strips_that_lay_decimetres_apart_lie_on_each_other(adjusted: Any) -> No
 def test_boresight_and_lever_arm_are_found_within_three_sigma(adjusted: Any) -> None:
     boresight, lever = adjusted.told["mount"]["boresight_deg"], adjusted.told["mount"]["lever_m"]
     assert boresight["state"] == ["estimated"] * 3
-    # over strips at one height nothing tells how high the scanner sits
-    assert lever["state"] == ["estimated", "estimated", "held"]
+    # over strips at one height hardly anything tells how high the scanner sits: half of what was known before, a hair's breadth
+    # beside where it is held; along and across it is known ten times as well
+    assert lever["state"][:2] == ["estimated", "estimated"]
+    assert lever["sigma"][2] > 0.4 * lever["prior_sigma"]
+    assert max(lever["sigma"][:2]) < 0.15 * lever["prior_sigma"]
     error = np.array(boresight["right_forward_up"]) - [0.2, -0.15, 0.25]
     assert (np.abs(error) < 3 * np.array(boresight["sigma"])).all()
     assert (np.array(boresight["sigma"]) < 0.03).all()
