@@ -24,7 +24,8 @@ _STILL_ACTIVE: Final = 259
 def without(*names: str) -> Iterator[None]:
     """Import libraries as if some packages were not installed that they would load if they can, and that nothing here uses."""
     hidden = [name for name in names if name not in sys.modules]
-    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None: not to be had
+    # a name that stands for None raises ImportError (the import system's own rule), which typeshed's dict of modules does not know
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]
     try:
         yield
     finally:

@@ -11,10 +11,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.analysis.banks.work import LEAST_DROP_M, LEAST_SLOPE_DEG, MOST_RETREAT_M, STRETCH_M
     from groundproc.analysis.terrain.settings import PRESETS
+    from groundproc.commands.inputs import add_epochs
     from groundproc.commands.outputs import add_force
 
-    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
-    parser.add_argument("--before", type=Path, metavar="CLOUD", help="the same place earlier: retreat and volume")
+    add_epochs(parser, "retreat and volume")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="BANKS.geojson", help="lines, .geojson or .gpkg"
     )
@@ -38,24 +38,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--most-retreat", type=float, default=MOST_RETREAT_M, metavar="M",
         help=f"with --before: how far an edge may have gone [m]; default: {MOST_RETREAT_M:g}",
     )  # fmt: skip
-    parser.add_argument("--registered", action="store_true", help="with --before: they lie on each other already")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Find them, and say what there is."""
-    from flightlog.errors import UsageError
     from groundproc.analysis.banks.work import Task, work
     from groundproc.commands.figures import claim_json, points_bar, warn, write_json
-    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
+    from groundproc.commands.inputs import epochs
     from groundproc.commands.outputs import claim_file
     from groundproc.vectors.features import DRIVERS
 
-    inputs = [arguments.cloud] + ([] if arguments.before is None else [arguments.before])
-    expect(inputs, CLOUD, CLOUD_WORDS)
-    if arguments.registered and arguments.before is None:
-        raise UsageError("--registered given, but nothing uses it; expected with --before")
+    inputs = epochs(arguments)
     claim_file(arguments.output, tuple(DRIVERS), arguments.force, inputs)
     claim_json(arguments)
     task = Task(

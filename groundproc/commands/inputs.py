@@ -1,5 +1,6 @@
 """Files that a command is given: that they are there and of the kind that it takes, before the work begins."""
 
+import argparse
 import difflib
 import sys
 from collections.abc import Iterable
@@ -121,3 +122,28 @@ def inside(folder: Path) -> str:
     if not logs:
         return ""
     return f"; it holds {logs[0]}" + (f" and {len(logs) - 1} more logs" if len(logs) > 1 else "")
+
+
+def add_epochs(parser: argparse.ArgumentParser, earlier: str) -> None:
+    """Declare a cloud, and the same place earlier; `earlier` says what that one is for."""
+    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
+    parser.add_argument("--before", type=Path, metavar="CLOUD", help=f"the same place earlier: {earlier}")
+    parser.add_argument("--registered", action="store_true", help="with --before: they lie on each other already")
+
+
+def epochs(arguments: argparse.Namespace) -> list[Path]:
+    """The one cloud or the two that `add_epochs` took, which are there and clouds.
+
+    Raises
+    ------
+    CaptureError
+    UsageError
+        Registered, and nothing to be registered with.
+    """
+    from flightlog.errors import UsageError
+
+    given = [arguments.cloud] + ([] if arguments.before is None else [arguments.before])
+    expect(given, CLOUD, CLOUD_WORDS)
+    if arguments.registered and arguments.before is None:
+        raise UsageError("--registered given, but nothing uses it; expected with --before")
+    return given

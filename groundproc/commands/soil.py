@@ -10,10 +10,10 @@ HELP = "find disturbed soil: patches of ground that stand out by height and refl
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.analysis.soil import LEAST_M, LEAST_SCORE, SIZE_M
+    from groundproc.commands.inputs import add_epochs
     from groundproc.commands.outputs import add_force
 
-    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="a LAS, LAZ or COPC file")
-    parser.add_argument("--before", type=Path, metavar="CLOUD", help="the same place earlier: changes are looked for")
+    add_epochs(parser, "changes are looked for")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="SOIL.geojson", help="patches, .geojson or .gpkg"
     )
@@ -28,7 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--least-height", type=float, default=LEAST_M, metavar="M",
         help=f"height or depth of a patch, at least [m]; default: {LEAST_M:g}",
     )  # fmt: skip
-    parser.add_argument("--registered", action="store_true", help="with --before: they lie on each other already")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)
 
@@ -38,14 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
     from flightlog.errors import UsageError
     from groundproc.analysis.soil import Task, work
     from groundproc.commands.figures import claim_json, points_bar, warn, write_json
-    from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
+    from groundproc.commands.inputs import epochs
     from groundproc.commands.outputs import claim_file
     from groundproc.vectors.features import DRIVERS
 
-    inputs = [arguments.cloud] + ([] if arguments.before is None else [arguments.before])
-    expect(inputs, CLOUD, CLOUD_WORDS)
-    if arguments.registered and arguments.before is None:
-        raise UsageError("--registered given, but nothing uses it; expected with --before")
+    inputs = epochs(arguments)
     for option, value, unit in (("score", arguments.least_score, ""), ("height", arguments.least_height, " m")):
         if not 0.0 < value <= 1000.0:
             raise UsageError(f"--least-{option} {value:g}{unit}: expected more than 0 and up to 1000{unit}")

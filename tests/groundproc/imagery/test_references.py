@@ -1,7 +1,6 @@
 """What bands are put on a scale of reflectance by, where there are no panels: the light on the ground, and the lidar's own reflectance."""
 
 import base64
-import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -87,10 +86,9 @@ def test_rows_of_a_micasense_picture_differ_as_it_says() -> None:
     assert irradiance.rows({}, 101, 1e-3) is None
 
 
-@pytest.mark.skipif("SWATH_RECORDINGS" not in os.environ, reason="SWATH_RECORDINGS is not set")
-def test_four_bands_of_a_sequoia_say_that_the_light_fell_alike() -> None:
+def test_four_bands_of_a_sequoia_say_that_the_light_fell_alike(recordings: Path) -> None:
     """Between two moments five seconds apart, under one sky: by 1 %, each band by its own sensor."""
-    folder = Path(os.environ["SWATH_RECORDINGS"]) / "images" / "garfield" / "msp"
+    folder = recordings / "images" / "garfield" / "msp"
     falls = []
     for band in ("GRE", "RED", "REG", "NIR"):
         found = [lit(path, 1e-3, 100.0) for path in sorted(folder.glob(f"*_{band}.TIF"))]
