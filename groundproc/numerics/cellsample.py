@@ -1,6 +1,6 @@
 """A sample of a cloud that keeps whole cells of ground: densities and surfaces are in it as they are in the cloud."""
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,13 +10,12 @@ from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 
-_RAREST: Final = 1 << 30
-
 
 class CellSample:
-    """Takes points piece by piece, and holds those of some cells: of all at first, and of half as many whenever there are too many.
+    """Takes points piece by piece, and holds those of some cells: of all at first, and of ever fewer as points become too many.
 
-    Which cells stay follows from their place alone, so the sample does not hang on the pieces.
+    Cells stand in an order that follows from their place alone, as if shuffled; held are as many of the first as have room. So the sample
+    does not hang on the pieces, and is never empty, however unevenly the points are spread.
 
     Parameters
     ----------
@@ -24,47 +23,39 @@ class CellSample:
         Side of a cell on the map.
     most : int
         Points that are held, at most: of a single cell that has more, those that come first.
-
-    Attributes
-    ----------
-    every : int
-        One of so many cells is held.
     """
 
     def __init__(self, cell_m: float, most: int) -> None:
-        self.every = 1
         self._cell_m, self._most = cell_m, most
+        self._last: int | None = None  # place in the order of the last cell that is held; None: all are
         self._parts: list[tuple[npt.NDArray[np.int64], Array]] = []
         self._held = 0
 
     def add(self, xyz_m: Array) -> None:
         """Take points, shape (n, 3)."""
-        self._keep(cells(np.ascontiguousarray(xyz_m), self._cell_m), xyz_m)
-        while self._held > self._most and not self._alone():
-            self.every *= 2
-            parts, self._parts, self._held = self._parts, [], 0
-            for part in parts:
-                self._keep(*part)
-        if self._held > self._most:
-            keys, xyz = self._parts[-1]
-            left = max(len(keys) - (self._held - self._most), 0)
-            self._parts[-1] = keys[:left], xyz[:left]
-            self._held += left - len(keys)
+        self._keep(places(np.ascontiguousarray(xyz_m), self._cell_m), xyz_m)
+        if self._held <= self._most:
+            return
+        order, count = np.unique(np.concatenate([places for places, _ in self._parts]), return_counts=True)
+        self._last = int(order[max(np.searchsorted(np.cumsum(count), self._most, side="right") - 1, 0)])
+        parts, self._parts, self._held = self._parts, [], 0
+        for part in parts:
+            self._keep(*part)
+        if self._held > self._most:  # one cell alone
+            place, xyz = (np.concatenate(each)[: self._most] for each in zip(*self._parts, strict=True))
+            self._parts, self._held = [(place, xyz)], self._most
 
     def points(self) -> Array:
         """Those held, shape (k, 3)."""
         return np.concatenate([np.empty((0, 3)), *(xyz for _, xyz in self._parts)])
 
-    def _keep(self, keys: npt.NDArray[np.int64], xyz_m: Array) -> None:
-        wanted = chosen(keys, self.every)
-        if wanted.any():
-            self._parts.append((keys[wanted], xyz_m[wanted]))
-            self._held += int(np.count_nonzero(wanted))
-
-    def _alone(self) -> bool:
-        """Whether all are of one cell, or of cells that no thinning tells apart."""
-        first = next(keys[0] for keys, _ in self._parts if len(keys))
-        return self.every >= _RAREST or not any((keys != first).any() for keys, _ in self._parts)
+    def _keep(self, place: npt.NDArray[np.int64], xyz_m: Array) -> None:
+        if self._last is not None:
+            wanted = place <= self._last
+            place, xyz_m = place[wanted], xyz_m[wanted]
+        if len(place):
+            self._parts.append((place, xyz_m))
+            self._held += len(place)
 
 
 @njit(cache=True, nogil=True)
@@ -82,4 +73,13 @@ def chosen(keys: Any, every: int) -> Any:
     out = np.empty(len(keys), np.bool_)
     for i in range(len(keys)):
         out[i] = spread(keys[i]) % every == 0
+    return out
+
+
+@njit(cache=True, nogil=True)
+def places(xyz: Any, cell_m: float) -> Any:
+    """Where in the shuffled order of all cells that of each point stands, shape (n,)."""
+    out = cells(xyz, cell_m)
+    for i in range(len(out)):
+        out[i] = spread(out[i])
     return out

@@ -31,6 +31,20 @@ def test_of_a_large_one_some_cells_are_held_with_all_their_points(pieces: int) -
     assert len(held) == sum(inside)  # whatever the pieces
 
 
+@pytest.mark.parametrize("pieces", [1, 5])
+def test_of_a_few_crowded_cells_some_are_held_too(pieces: int) -> None:
+    """As from a hovering aircraft: half of all points on one part in a hundred. Halving the cells once left none at all."""
+    rng = np.random.default_rng(3)
+    crowded = np.concatenate([spread(120.0, 2.0), spread(12.0, 200.0)])
+    xyz = crowded[rng.permutation(len(crowded))]
+    sample = CellSample(4.0, 6_000)
+    for piece in np.array_split(xyz, pieces):
+        sample.add(piece)
+    held = sample.points()
+    assert 2_500 < len(held) <= 6_000
+    assert len({tuple(each) for each in np.floor(held[:, :2] / 4.0).astype(int)}) > 1
+
+
 def test_of_a_single_cell_no_more_than_asked_for_is_held() -> None:
     sample = CellSample(4.0, 1_000)
     for seed in range(3):
