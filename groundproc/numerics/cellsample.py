@@ -36,8 +36,9 @@ class CellSample:
         self._keep(places(np.ascontiguousarray(xyz_m), self._cell_m), xyz_m)
         if self._held <= self._most:
             return
-        order, count = np.unique(np.concatenate([places for places, _ in self._parts]), return_counts=True)
-        self._last = int(order[max(np.searchsorted(np.cumsum(count), self._most, side="right") - 1, 0)])
+        order, count = np.unique(np.concatenate([place for place, _ in self._parts]), return_counts=True)
+        room = int(np.searchsorted(np.cumsum(count), self._most, side="right"))
+        self._last = int(order[max(room - 1, 0)])
         parts, self._parts, self._held = self._parts, [], 0
         for part in parts:
             self._keep(*part)
