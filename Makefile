@@ -2,7 +2,8 @@
 #   make setup       the environment: apt packages where they are missing, .venv with everything, kernels compiled
 #   make demo        a simulated flight into the real daemon, processed to a cloud with pictures
 #   make test        all tests but the long ones
-#   make check       format, lint, types, import contracts, then the tests
+#   make static      format, lint, types, import contracts
+#   make check       those, then the tests
 #   make soak        the long tests: hour-long logs, many seeds
 #   make bench-NAME  one benchmark of benchmarks/; its last line is one JSON object
 #   make bench       all of them, into docs/benchmarks.md, but the longest: `benchmarks/all.py --only kit study windows`
@@ -21,9 +22,9 @@ PYTEST := $(BIN)/pytest
 # A file of tests stays on one worker, so that what its fixtures made is made once.
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: setup demo test check soak bench docs deb release clean
+.PHONY: setup demo static test check soak bench docs deb release clean
 
-setup: $(VENV)/.installed
+setup: $(VENV)/.warm
 
 $(VENV)/.apt: apt-packages.txt
 	@mkdir -p $(VENV)
@@ -55,6 +56,9 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@# a test lets MAVProxy show our messages; what it would bring along (vtk, opencv) is not needed for that
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
+	@touch $@
+
+$(VENV)/.warm: $(VENV)/.installed
 	@$(BIN)/swath warmup || echo "warning: swath warmup failed: what is not compiled yet is compiled at first use" >&2
 	@touch $@
 
@@ -64,11 +68,15 @@ demo: setup
 test: setup
 	$(PYTEST) -m "not soak" $(PARALLEL)
 
-check: setup
+static: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Compiling and reading the types take one core each for minutes: side by side.
+check: $(VENV)/.installed
+	$(MAKE) --no-print-directory --jobs 2 --output-sync=target setup static
 	$(MAKE) --no-print-directory test
 
 # Its last line is one JSON object: what the tests found, all of them together.
