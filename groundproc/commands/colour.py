@@ -12,9 +12,11 @@ SUFFIXES = (".laz", ".las")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="LAS, LAZ or COPC file")
     add_images(parser)
+    add_all_classes(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the coloured cloud, .laz")
     parser.add_argument(
         "--least-views",
@@ -70,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     task = Task(
         arguments.cloud, arguments.images, arguments.output, arguments.photos,
         count(arguments.least_views, "--least-views"), None if arguments.crs is None else projected_crs(arguments.crs),
-        not arguments.no_balance, arguments.overlays,
+        not arguments.no_balance, arguments.overlays, all_classes=arguments.all_classes,
     )  # fmt: skip
     with tqdm(unit="", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

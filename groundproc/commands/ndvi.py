@@ -11,9 +11,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.colour import add_images
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="LAS, LAZ or COPC file of the place")
     add_images(parser)
+    add_all_classes(parser)
     parser.add_argument("--gsd", type=float, default=0.05, metavar="M", help="size of a pixel [m]; default: 0.05")
     parser.add_argument(
         "--index", default="ndvi", metavar="NAME", help="ndvi, gndvi, ndre, ndwi or bndvi; default: ndvi"
@@ -68,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     task = Task(
         arguments.cloud, arguments.images, arguments.output, arguments.gsd, arguments.index, arguments.panels,
         arguments.draped, arguments.photos, None if arguments.crs is None else projected_crs(arguments.crs),
-        arguments.reference,
+        arguments.reference, all_classes=arguments.all_classes,
     )  # fmt: skip
     with tqdm(unit="", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

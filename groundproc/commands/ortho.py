@@ -11,9 +11,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.colour import add_images
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="LAS, LAZ or COPC file of the place")
     add_images(parser)
+    add_all_classes(parser)
     parser.add_argument("--gsd", type=float, default=0.05, metavar="M", help="size of a pixel [m]; default: 0.05")
     parser.add_argument(
         "--bands",
@@ -43,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     bands = tuple(word.strip() for word in arguments.bands.split(",")) if arguments.bands else ()
     task = Task(
         arguments.cloud, arguments.images, arguments.output, arguments.gsd, arguments.photos, bands,
-        None if arguments.crs is None else projected_crs(arguments.crs), not arguments.no_balance,
+        None if arguments.crs is None else projected_crs(arguments.crs), not arguments.no_balance, all_classes=arguments.all_classes,
     )  # fmt: skip
     for path in (arguments.output, task.sources):
         claim_file(path, SUFFIXES, arguments.force, [arguments.cloud])

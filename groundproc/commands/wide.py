@@ -11,9 +11,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.colour import add_images
     from groundproc.commands.outputs import add_force
+    from groundproc.commands.selecting import add_all_classes
 
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="LAS, LAZ or COPC file of the place")
     add_images(parser)
+    add_all_classes(parser)
     parser.add_argument(
         "--within",
         type=float,
@@ -49,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     claim_folder(arguments.output, (JSON, POSES, RIG, *there), arguments.force)
     task = Task(
         arguments.cloud, arguments.images, arguments.output, arguments.photos, arguments.within,
-        None if arguments.crs is None else projected_crs(arguments.crs), not arguments.no_balance,
+        None if arguments.crs is None else projected_crs(arguments.crs), not arguments.no_balance, all_classes=arguments.all_classes,
     )  # fmt: skip
     with tqdm(unit="", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
 

@@ -12,7 +12,6 @@ import pyproj
 
 from flightlog.errors import CaptureError, UsageError
 from groundproc.cloud import reader
-from groundproc.cloud.selection import Choice
 from groundproc.imagery import pictures
 from groundproc.imagery.camera import Camera
 from groundproc.imagery.painting.visibility import Eye
@@ -99,16 +98,14 @@ class Block:
     left_out: tuple[str, ...]
 
 
-def of_cloud(
-    cloud: Path, images: Path, photos: Path | None, crs: pyproj.CRS | None, *choices: Choice
-) -> tuple[reader.Cloud, Block]:
-    """A cloud, or the points of it that are chosen, and the images of its place.
+def of_cloud(cloud: Path, images: Path, photos: Path | None, crs: pyproj.CRS | None) -> tuple[reader.Cloud, Block]:
+    """A cloud and the images of its place.
 
     Raises
     ------
     UsageError, CaptureError, ConfigError
     """
-    look = reader.look(cloud, *choices)
+    look = reader.look(cloud)
     return look, load(images, photos, crs or look.horizontal, cloud)
 
 

@@ -51,6 +51,8 @@ class Task:
         Bring the images to one exposure.
     overlays : Path, optional
         Folder for a picture of each camera with the points over it.
+    all_classes : bool
+        Noise and what moves hide what is behind them, and have a colour.
     """
 
     cloud: Path
@@ -61,6 +63,7 @@ class Task:
     crs: pyproj.CRS | None = None
     balance: bool = True
     overlays: Path | None = None
+    all_classes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,8 @@ class Made:
     Attributes
     ----------
     points, coloured : int
+    no_surface : int
+        Of the points, noise and what moved: images are not asked about them.
     images : int
     bands : tuple of str
     held_out : mapping of str to float
@@ -86,6 +91,7 @@ class Made:
 
     points: int
     coloured: int
+    no_surface: int
     images: int
     bands: tuple[str, ...]
     held_out: Mapping[str, float]
@@ -108,7 +114,7 @@ def colour(task: Task, progress: Progress) -> Made:
     """
     cloud, block = of_cloud(task.cloud, task.images, task.photos, task.crs)
     layers, unused = _layers(block)
-    with laid_out(cloud, block.site, task.output, progress) as (scene, folder):
+    with laid_out(cloud, block.site, task.output, progress, task.all_classes) as (scene, folder):
         seen = mapped(folder / "seen", np.uint8, (cloud.points,))
         laid = [_laid(task, block, layer, scene, folder / str(number), progress) for number, layer in enumerate(layers)]
         columns: dict[str, npt.NDArray[Any]] = {}
@@ -122,12 +128,13 @@ def colour(task: Task, progress: Progress) -> Made:
         _write(task, cloud, columns | {VIEWS: seen}, progress)
         coloured = int(np.count_nonzero(seen))
         views = float(seen.sum(dtype=np.int64) / coloured) if coloured else 0.0
+        no_surface = scene.size - scene.standing
     failed = tuple(sentence for one in laid for sentence in one.failed)
     images = sum(len(layer.images) for layer in layers) - len(failed)
     by_band = {band: value for one in reversed(laid) for band, value in one.score.bands.items()}
     by_image = {name: value for one in laid for name, value in one.score.images.items()}
     left_out = (*block.left_out, *unused, *failed)
-    return Made(cloud.points, coloured, images, tuple(columns), by_band, by_image, left_out, views, drawn)
+    return Made(cloud.points, coloured, no_surface, images, tuple(columns), by_band, by_image, left_out, views, drawn)
 
 
 class _Laid(NamedTuple):
@@ -184,6 +191,8 @@ def _columns(
 ) -> dict[str, npt.NDArray[Any]]:
     """The attributes that a layer gives, in the order of the file."""
     found = {band: mapped(folder / band, dimension(band).column, (scene.size,)) for band in layer.bands}
+    if TEMPERATURE in found:
+        found[TEMPERATURE][:] = np.nan  # where no image is asked
     differ = None
     if TEMPERATURE in layer.bands:
         scale, _ = response_of(block.rig.cameras[layer.images[0].camera].response)
@@ -240,12 +249,14 @@ def _write(task: Task, cloud: reader.Cloud, columns: Mapping[str, npt.NDArray[An
 
 def sentences(made: Made) -> Sequence[str]:
     """For people."""
-    share = made.coloured / made.points
+    share = made.coloured / max(made.points - made.no_surface, 1)
+    others = f"; {made.no_surface:,} are noise or moved, and have no colour" if made.no_surface else ""
     by_band = ", ".join(f"{band} {value:.1f} %" for band, value in made.held_out.items())
     name = worst(made.held_out_images)
     most = f"; most in {name}, {made.held_out_images[name]:.1f} %" if name else ""
+    seen = f"{made.coloured:,} of {made.points - made.no_surface:,} points ({share:.1%})"
     return [
-        f"{made.coloured:,} of {made.points:,} points ({share:.1%}) are seen by {made.images} images, {made.views:.1f} each",
+        f"{seen} are seen by {made.images} images, {made.views:.1f} each{others}",
         *(
             [f"held out, an image differs from what the others say by {by_band} of the full scale, rms{most}"]
             if by_band

@@ -71,6 +71,8 @@ class Task:
     crs : pyproj.CRS, optional
     reference : str, optional
         Of `REFERENCES`; default: the first that there is.
+    all_classes : bool
+        Noise and what moves stand too.
     """
 
     cloud: Path
@@ -83,6 +85,7 @@ class Task:
     photos: Path | None = None
     crs: pyproj.CRS | None = None
     reference: str | None = None
+    all_classes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +147,9 @@ def indices(task: Task, progress: Progress) -> Made:
     """
     upper, lower = INDICES[task.index]
     panels = [] if task.panels is None else read_panels(task.panels, (upper, lower))
-    with ground(task.cloud, task.images, task.photos, task.crs, task.gsd_m, task.output, progress) as place:
+    with ground(
+        task.cloud, task.images, task.photos, task.crs, task.gsd_m, task.output, progress, task.all_classes
+    ) as place:
         roof = _roof([_layer_with(place.block, band) for band in (upper, lower)])
         sources = _sources(place, (upper, lower), roof, progress)
         lines, warnings, points = _referenced(task, place, sources, panels, roof, progress)
@@ -361,6 +366,7 @@ def _on_points(place: Ground, sources: Mapping[str, _Source], roof: _Roof, progr
         views = room(place.scene.size, bright, folder)
         paint(place.block, bright, place.scene, views, lambda n: progress("points", n), _loader(place.block, roof))
         bands[band] = mapped(folder / "band", np.float32, (place.scene.size,))
+        bands[band][:] = np.nan  # noise and what moves are seen by nobody
         for square in place.scene.squares:
             values = blend(part(views, square.points), source.factor, 1.0, 1)[:, source.plane]
             bands[band][place.scene.number[square.points]] = values

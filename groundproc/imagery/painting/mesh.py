@@ -11,7 +11,6 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog.errors import CaptureError, UsageError
-from groundproc.cloud.selection import SURFACES
 from groundproc.imagery.painting.block import COLOURS, Block, Layer, of_cloud
 from groundproc.imagery.painting.charts import Chart, charts
 from groundproc.imagery.painting.gltf import Piece, write_glb
@@ -42,6 +41,8 @@ class Task:
         Of the texture; 0: as a pixel of the images on the ground.
     crs : pyproj.CRS, optional
     balance : bool
+    all_classes : bool
+        Noise and what moves stand too.
     """
 
     cloud: Path
@@ -52,6 +53,7 @@ class Task:
     texel_m: float = 0.0
     crs: pyproj.CRS | None = None
     balance: bool = True
+    all_classes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +97,12 @@ def mesh(task: Task, progress: Progress) -> Made:
     ------
     CaptureError, ConfigError, UsageError, SourceError
     """
-    cloud, block = of_cloud(task.cloud, task.images, task.photos, task.crs, SURFACES)
+    cloud, block = of_cloud(task.cloud, task.images, task.photos, task.crs)
     crs = task.crs or cloud.horizontal
     layer = _colours(block, task.images)
-    with laid_out(cloud, block.site, task.output, progress) as (scene, folder):
+    with laid_out(cloud, block.site, task.output, progress, task.all_classes) as (scene, folder):
         spacing_m = float(np.median([square.spacing_m for square in scene.squares]))
-        surface = surface_of(cloud, spacing_m, task.cell_m or _FINEST_M)
+        surface = surface_of(cloud, spacing_m, task.cell_m or _FINEST_M, task.all_classes)
         texel_m = task.texel_m or _pixel_m(block, layer, scene)
         area_m2 = np.count_nonzero(np.isfinite(surface.height_m)) * surface.grid.cell_m**2
         if area_m2 / texel_m**2 > _MOST_TEXELS:

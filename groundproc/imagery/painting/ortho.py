@@ -12,7 +12,6 @@ import pyproj
 
 from flightlog.errors import UsageError
 from groundproc.cloud import reader
-from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.imagery.painting.balance import gains
 from groundproc.imagery.painting.block import COLOURS, Block, Layer, of_cloud
@@ -44,6 +43,8 @@ class Task:
         Which layer; default: the colours, or the only one.
     crs : pyproj.CRS, optional
     balance : bool
+    all_classes : bool
+        Noise and what moves stand too.
     """
 
     cloud: Path
@@ -54,6 +55,7 @@ class Task:
     bands: tuple[str, ...] = ()
     crs: pyproj.CRS | None = None
     balance: bool = True
+    all_classes: bool = False
 
     @property
     def sources(self) -> Path:
@@ -106,13 +108,14 @@ def ground(
     gsd_m: float,
     beside: Path,
     progress: Progress,
+    all_classes: bool,
 ) -> Iterator[Ground]:
     """Get ready for mosaics with pixels of a size; the scratch folder lies beside the output, and goes when this is left."""
     checked_cell(gsd_m)
     look, block = of_cloud(cloud, images, photos, crs)
-    with laid_out(look, block.site, beside, progress) as (scene, folder):
+    with laid_out(look, block.site, beside, progress, all_classes) as (scene, folder):
         spacing_m = float(np.median([square.spacing_m for square in scene.squares]))
-        surface = surface_of(reader.look(cloud, SURFACES), spacing_m, gsd_m)
+        surface = surface_of(look, spacing_m, gsd_m, all_classes)
         yield Ground(look, block, scene, surface, _fine(surface.grid, gsd_m), folder)
 
 
@@ -123,7 +126,9 @@ def ortho(task: Task, progress: Progress) -> Made:
     ------
     CaptureError, ConfigError, UsageError, SourceError
     """
-    with ground(task.cloud, task.images, task.photos, task.crs, task.gsd_m, task.output, progress) as place:
+    with ground(
+        task.cloud, task.images, task.photos, task.crs, task.gsd_m, task.output, progress, task.all_classes
+    ) as place:
         layer = _layer(place.block, task.bands)
         block = place.block
         made = mosaic(

@@ -16,7 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from flightlog.errors import CaptureError
 from groundproc.cloud import reader
+from groundproc.cloud.selection import CLASS, standing
 from groundproc.cloud.spool import Spool
 from groundproc.imagery.painting.planes import Known, columns, surfaces
 from groundproc.imagery.painting.visibility import Surface
@@ -86,7 +88,7 @@ class Tiles(NamedTuple):
 
 
 class Scene:
-    """A cloud in squares.
+    """A cloud in squares: what stands of it. Noise and what moves hide nothing and are seen by nobody; they lie in no square.
 
     Parameters
     ----------
@@ -97,11 +99,30 @@ class Scene:
         For some 56 bytes a point.
     progress : callable
         Told of points read.
+    all_classes : bool
+        Noise and what moves stand too.
+
+    Raises
+    ------
+    CaptureError
+        Nothing stands.
     """
 
-    def __init__(self, cloud: reader.Cloud, site: Site, folder: Path, progress: Callable[[int], object]) -> None:
-        spool, base_m = _spooled(cloud, folder, progress)
+    def __init__(
+        self,
+        cloud: reader.Cloud,
+        site: Site,
+        folder: Path,
+        progress: Callable[[int], object],
+        all_classes: bool = False,
+    ) -> None:
+        spool, base_m = _spooled(cloud, folder, progress, all_classes)
         self.size = cloud.points
+        """Of the file, and of all arrays by point."""
+        self.standing = sum(spool.counts.values())
+        if not self.standing:
+            why = "has no points" if not self.size else "has noise and what moved only (classes 7, 18 and 69)"
+            raise CaptureError(f"{cloud.path}: {why}; expected points of surfaces, on which images are laid")
         self.xyz_m = mapped(folder / "xyz", np.float32, (self.size, 3))
         """From the centre of each point's square."""
         self.spacing_m = mapped(folder / "spacing", np.float32, (self.size,))
@@ -144,12 +165,13 @@ class Scene:
 
 @contextmanager
 def laid_out(
-    cloud: reader.Cloud, site: Site, output: Path, progress: Callable[[str, int], object]
+    cloud: reader.Cloud, site: Site, output: Path, progress: Callable[[str, int], object], all_classes: bool
 ) -> Iterator[tuple[Scene, Path]]:
     """A cloud as images look at it, and the scratch folder that it lies in: beside the output, and gone when this is left."""
     beside = next(folder for folder in output.resolve().parents if folder.is_dir())
     with tempfile.TemporaryDirectory(prefix=".swath-images-", dir=beside) as scratch:
-        yield Scene(cloud, site, Path(scratch), lambda count: progress("reading", count)), Path(scratch)
+        scene = Scene(cloud, site, Path(scratch), lambda count: progress("reading", count), all_classes)
+        yield scene, Path(scratch)
 
 
 def _order(local: Array) -> tuple[npt.NDArray[np.int32], int]:
@@ -207,23 +229,28 @@ def mapped(path: Path, dtype: npt.DTypeLike, shape: tuple[int, ...]) -> npt.NDAr
     return np.asarray(found)  # compiled code wants plain arrays
 
 
-def _spooled(cloud: reader.Cloud, folder: Path, progress: Callable[[int], object]) -> tuple[Spool, float]:
-    """Points by square, from its corner, and the height that theirs are from."""
+def _spooled(
+    cloud: reader.Cloud, folder: Path, progress: Callable[[int], object], all_classes: bool
+) -> tuple[Spool, float]:
+    """Points that stand by square, from its corner, and the height that theirs are from."""
     spool, seen, base_m = Spool(_RECORD, folder), 0, None
-    for chunk in reader.chunks(cloud, columns=()):
-        xyz = chunk.points.xyz_m
+    for chunk in reader.chunks(cloud, columns=(CLASS,)):
+        number = seen + np.flatnonzero(standing(chunk.points, all_classes))
+        seen += len(chunk.points)
+        progress(len(chunk.points))
+        if not len(number):
+            continue
+        xyz = chunk.points.xyz_m[number - seen + len(chunk.points)]
         base_m = float(np.floor(xyz[0, 2])) if base_m is None else base_m
         place = np.floor(xyz[:, :2] / SIDE_M).astype(np.int64)
-        packed, number = np.unique(place[:, 0] << 32 | (place[:, 1] + _HALF), return_inverse=True)
+        packed, of_place = np.unique(place[:, 0] << 32 | (place[:, 1] + _HALF), return_inverse=True)
         places = np.stack([packed >> 32, (packed & 0xFFFFFFFF) - _HALF], axis=1)
         records = np.empty(len(xyz), _RECORD)
         for axis, name in enumerate("xy"):
             records[name] = xyz[:, axis] - place[:, axis] * SIDE_M
         records["z"] = xyz[:, 2] - base_m
-        records["number"] = np.arange(seen, seen + len(xyz))
-        spool.add_sorted(records, number.reshape(-1).astype(np.int32), [(int(x), int(y)) for x, y in places])
-        seen += len(xyz)
-        progress(len(xyz))
+        records["number"] = number
+        spool.add_sorted(records, of_place.reshape(-1).astype(np.int32), [(int(x), int(y)) for x, y in places])
     return spool, base_m or 0.0
 
 

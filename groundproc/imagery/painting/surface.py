@@ -8,6 +8,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from groundproc.cloud import reader
+from groundproc.cloud.selection import CLASS, standing
 from groundproc.raster.cells import Cells
 from groundproc.raster.fill import fill
 from groundproc.raster.grid import Grid
@@ -77,11 +78,12 @@ class Surface:
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True), np.float32)
 
 
-def surface_of(cloud: reader.Cloud, spacing_m: float, least_m: float) -> Surface:
-    """The tops of a cloud whose points stand so far apart; cells are no smaller than `least_m`."""
+def surface_of(cloud: reader.Cloud, spacing_m: float, least_m: float, all_classes: bool = False) -> Surface:
+    """The tops of what stands of a cloud, whose points are so far apart; cells are no smaller than `least_m`."""
     cells = Cells(max(round(_CELL * spacing_m, 3), least_m), ("max",))
-    for chunk in reader.chunks(cloud, columns=()):
-        cells.add(chunk.points.xyz_m, chunk.points.xyz_m[:, 2])
+    for chunk in reader.chunks(cloud, columns=(CLASS,)):
+        xyz_m = chunk.points.xyz_m[standing(chunk.points, all_classes)]
+        cells.add(xyz_m, xyz_m[:, 2])
     grid = cells.grid()
     assert grid is not None
     known = cells.window(grid, "max")

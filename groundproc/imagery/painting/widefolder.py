@@ -40,6 +40,8 @@ class Task:
         Images of one instant are no further apart.
     crs : pyproj.CRS, optional
     balance : bool
+    all_classes : bool
+        Noise and what moves stand too.
     """
 
     cloud: Path
@@ -49,6 +51,7 @@ class Task:
     within_s: float = 0.05
     crs: pyproj.CRS | None = None
     balance: bool = True
+    all_classes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +119,7 @@ def wide(task: Task, progress: Progress) -> Made:
     done: list[Instant] = []
     failed: list[str] = []
     filled = 0.0
-    with laid_out(cloud, block.site, task.output, progress) as (scene, _):
+    with laid_out(cloud, block.site, task.output, progress, task.all_classes) as (scene, _):
         for number, instant in enumerate(found, 1):
             try:
                 values = merged(block, scene, stands, instant, bands, shown, task.balance)
