@@ -39,7 +39,8 @@ from fastcrc import crc32
 
 from flightlog import hdl32e, records
 from flightlog.constants import NS_PER_S
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from onboard.datagrams import Receiver, open_udp
 
 SENSOR_RATE: Final = NS_PER_S / hdl32e.PACKET_NS

@@ -28,7 +28,7 @@ from groundproc.flight.timeline import LidarRun
 from groundproc.geodesy import LocalFrame
 from groundproc.trajectory.table import from_poses
 from simulator.config import Options
-from simulator.render import Job, Simulation
+from simulator.simulation import Job, Simulation
 
 ROUNDS = 9
 STREAM = 4

@@ -25,9 +25,11 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from flightlog import hdl32e, mavlink, nmea, records
 from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US
 from flightlog.errors import LogError
-from flightlog.logfile import LogReader, LogWriter, Message
+from flightlog.logfile import LogReader, Message
+from flightlog.logwriter import LogWriter
 from flightlog.mavlink import Frame, FrameParser
 from groundproc.flight import load
+from groundproc.flight.positionpackets import position_samples
 
 Address = tuple[str, int, int]
 """Link, system, component."""
@@ -100,7 +102,7 @@ def measure(reader: LogReader) -> Period:
     device, receive = _lidar_times(reader)
     if len(receive) < 2:
         raise LogError(f"{reader.path}: {len(receive)} lidar packets, expected a flight")
-    samples = load.position_samples([reader])
+    samples = position_samples([reader])
     spans = [int(receive[-1] - receive[0]) + hdl32e.PACKET_NS, _span_ns(samples.receive_time_ns)]
     boot_rates: dict[str, float] = {}
     counts: dict[Address, int] = {}

@@ -39,7 +39,7 @@ from groundproc.cli import main as swath
 from groundproc.cloud import reader
 from groundproc.raster.cells import Cells
 from groundproc.raster.sampling import bilinear
-from simulator import outdoors
+from simulator import outdoors, powerline
 
 Array = npt.NDArray[np.float64]
 ORIGIN: Final = np.array([533_000.0, 6_472_000.0, 0.0])
@@ -139,7 +139,7 @@ def wires(folder: Path) -> dict[str, Any]:
     """Conductors of simulated lines."""
     spans, found, false, worst = 0, 0, 0, 0.0
     for seed in range(5):
-        line = outdoors.power_line(seed)
+        line = powerline.power_line(seed)
         run("wires", write_cloud(folder / "c.laz", line.xyz), "-o", folder / "w.geojson")
         shapes, columns = features(folder / "w.geojson")
         of = np.isin(columns["kind"], ("conductor", "guard"))

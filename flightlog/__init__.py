@@ -32,7 +32,8 @@ errors, constants, config     the tree of errors; constants with source; YAML to
 clock, nmea                   time scales and how stamps unwrap; GPRMC
 frames, mount                 rotations; where lidar and antennas sit on the airframe
 hdl32e, mavlink, dataflash    the sensors' wire formats
-records, logfile              THE table of topics and their bytes; writer and reader of the log
+records                       THE table of topics, and the bytes of each record
+logwriter, logfile            writing a log; reading one, cut off or damaged ones too
 salvage                       a whole log out of a cut or damaged one
 vehicles, signing, words      who the autopilot is on a link, and whether it is he; text from outside, made harmless
 container, mcapwriter, walk   the records of an MCAP file; writing them; reading past damage

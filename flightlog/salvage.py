@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from flightlog.errors import LogError
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 
 SALVAGE: Final = "swath.salvage"
 """Metadata that marks a log which was made so."""

@@ -7,8 +7,9 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog.constants import NS_PER_S
-from onboard.health import LINK_SILENT_S, STALLED_NS, Level, LidarStatus, RecorderStatus, Status
+from onboard.health import LINK_SILENT_S, STALLED_NS, Level
 from onboard.lidarstate import State
+from onboard.status import LidarStatus, RecorderStatus, Status
 
 TEXT_BYTES: Final = 50
 """Of a STATUSTEXT."""

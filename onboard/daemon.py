@@ -18,17 +18,17 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mount import Mount, load_mount
 from flightlog.records import ClockSync, HostClock
-from onboard import announce, health, leftovers, logfolder, metrics, notify
+from onboard import announce, health, healthreport, leftovers, logfolder, metrics, notify
 from onboard.announce import Announcer
 from onboard.autopilot import Link
 from onboard.config import SwathdConfig
-from onboard.health import RecorderStatus, Status
 from onboard.journal import event
+from onboard.landing import Landing
 from onboard.lidar import LidarPort
 from onboard.readings import (
-    Endurance,
     LidarReadings,
     Rates,
+    RecorderReadings,
     clock_status,
     lidar_sync,
     link_status,
@@ -38,6 +38,7 @@ from onboard.readings import (
 from onboard.recorder import Recorder
 from onboard.relay import Relay
 from onboard.segment import Segment
+from onboard.status import Status, to_json
 from onboard.timesync import ClockWatch, LogTime, read_clocks
 from onboard.worker import Worker
 
@@ -48,35 +49,6 @@ _LIVE_POLL_MS: Final = 100
 """With somebody to watch: older packets are no live picture."""
 _END_S: Final = 60.0
 """How long a worker may take to end: a slow disk gets the time to take what is in the backlog."""
-
-
-class Landing:
-    """Tells a landing from an autopilot, or a stranger, that flips between armed and disarmed.
-
-    A vehicle has landed if it stays disarmed for `DISARMED_S`; no second landing counts within `APART_S`.
-    """
-
-    DISARMED_S: Final = 5.0
-    APART_S: Final = 30.0
-
-    def __init__(self) -> None:
-        self._was_armed = False
-        self._since_ns: int | None = None
-        self._landed_ns: int | None = None
-
-    def look(self, is_armed: bool | None, now_ns: int) -> bool:
-        """Take what is known now, None where nothing is; whether the aircraft has just landed."""
-        if is_armed is not False:
-            self._was_armed |= bool(is_armed)
-            self._since_ns = None
-            return False
-        self._since_ns = now_ns if self._since_ns is None else self._since_ns
-        if not self._was_armed or now_ns - self._since_ns < self.DISARMED_S * NS_PER_S:
-            return False
-        if self._landed_ns is not None and now_ns - self._landed_ns < self.APART_S * NS_PER_S:
-            return False
-        self._was_armed, self._landed_ns = False, now_ns
-        return True
 
 
 class Daemon:
@@ -133,8 +105,8 @@ class Daemon:
             self._links[name] = Link(name, link, self._log_time, self._put)
         self._rates = Rates()
         self._lidar_readings = LidarReadings(self._lidar, settings.lidar.interface)
-        self._announcer, self._endurance = Announcer(), Endurance()
-        self._keep_free_bytes = settings.recorder.min_free_mb << 20
+        self._recorder_readings = RecorderReadings(self._recorder, self._salvager, settings.recorder)
+        self._announcer = Announcer()
 
     def _open_segment(self, directory: Path, settings: SwathdConfig, mount: Mount) -> Segment:
         path = logfolder.next_segment_path(directory, self._boot_id)
@@ -246,7 +218,7 @@ class Daemon:
             self._announce(status)
             self._note_landing(health.armed(status, status.time_ns, self._boot_id))
             if not is_ready:
-                notify.ready(health.summary(status))
+                notify.ready(healthreport.summary(status))
                 is_ready = True
             self._stroke(status, now_ns)
             self._stop.wait(_STATUS_S)
@@ -281,7 +253,7 @@ class Daemon:
             _log.error("%s", "; ".join(reasons), extra=event("hang"))
             notify.status("; ".join(reasons))
         else:
-            notify.status(health.summary(status))
+            notify.status(healthreport.summary(status))
             notify.watchdog()
 
     def _failures(self) -> list[str]:
@@ -296,7 +268,7 @@ class Daemon:
     # Status -------------------------------------------------------------------------------------------------------
 
     def _write_status(self, status: Status) -> None:
-        texts = {self._status_path: health.to_json(status)}
+        texts = {self._status_path: to_json(status)}
         if self._metrics_path is not None:
             verdict = health.judge(status, status.time_ns, self._boot_id)
             armed = health.armed(status, status.time_ns, self._boot_id)
@@ -327,38 +299,9 @@ class Daemon:
                 name: link_status(name, link.counts, log_ns, self._rates.per_second)
                 for name, link in self._links.items()
             },
-            recorder=self._recorder_status(now.monotonic_ns),
+            recorder=self._recorder_readings.status(now.monotonic_ns),
             failures=self._failures(),
             downlink=None if self._relay is None else self._relay.status(self._rates.per_second),
-        )
-
-    def _recorder_status(self, now_ns: int) -> RecorderStatus:
-        assert self._recorder is not None
-        counts, backlog = self._recorder.counts, self._recorder.backlog
-        leftover = self._salvager.counts
-        try:
-            free_bytes = logfolder.free_bytes(Path(counts.directory or self._directory))
-        except OSError:  # the folder is gone; the recorder says so
-            free_bytes = 0
-        return RecorderStatus(
-            segment=counts.segment,
-            messages=counts.messages,
-            bytes_on_disk=counts.bytes_on_disk,
-            backlog_bytes=backlog.size_bytes,
-            refused=backlog.refused,
-            sync_age_s=(now_ns - counts.last_sync_ns) / NS_PER_S,
-            slowest_sync_ms=counts.slowest_sync_ms,
-            free_bytes=free_bytes,
-            minutes_left=self._endurance.minutes(now_ns / NS_PER_S, free_bytes, self._keep_free_bytes),
-            segments=counts.segments,
-            space=counts.space.value,
-            refused_for_space=counts.refused_for_space,
-            lost_on_disk=counts.lost_on_disk,
-            trouble=counts.trouble,
-            abandoned=counts.abandoned,
-            leftovers=leftover.found,
-            leftovers_mended=leftover.mended,
-            leftovers_left=leftover.left,
         )
 
 

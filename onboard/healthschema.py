@@ -6,7 +6,8 @@ import types
 import typing
 from typing import Any, Final
 
-from onboard.health import SCHEMA, Level, Status
+from onboard.health import SCHEMA, Level
+from onboard.status import Status
 
 _PLAIN: Final = {bool: "boolean", int: "integer", float: "number", str: "string", types.NoneType: "null"}
 

@@ -2,11 +2,10 @@
 
 import logging
 import select
-import socket
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -15,14 +14,16 @@ import numpy.typing as npt
 from flightlog import hdl32e, records
 from flightlog.constants import HOUR_NS, NS_PER_S, NS_PER_US
 from flightlog.records import SCAN_PACKET_DTYPE, LidarAccount
-from flightlog.words import clean_bytes
 from onboard import fovmask, lidarstate
+from onboard.backlog import Put
 from onboard.batch import BATCH_NS, Batch
 from onboard.clocksync import Envelope
 from onboard.config import LidarConfig
 from onboard.datagrams import granted_buffer_bytes, open_udp
 from onboard.fovmask import Window
-from onboard.packetfilter import address_number, address_text
+from onboard.lidarcounts import LidarCounts
+from onboard.lidarsender import LidarSender
+from onboard.positionpackets import PositionPackets
 from onboard.sensorview import SensorView, sectors_seen, view
 from onboard.timesync import LogTime
 from onboard.worker import Worker
@@ -40,51 +41,10 @@ _GROWTH: Final = 2.0
 _POSITION_SLOTS: Final = 128
 _STAMP_NS: Final = 50 * NS_PER_US
 """What a lidar's clock is good for when it follows a pulse (M-A p. 9)."""
-_OPEN_NS: Final = 3 * NS_PER_S
-"""A lidar silent for this long: everything is let in and looked at again, to tell why; it is not recorded."""
-_FORGET_NS: Final = 10 * NS_PER_S
-"""A lidar silent for this long may come back with another address, unless the configuration says which it has."""
 _CLOCK_NS: Final = NS_PER_S // 2
 """How often the lidar's clock is looked at."""
 _LOOKS: Final = 64
 """Polls of which the directions are kept until somebody asks how the lidar is set; a second has half as many at 20 times its rate."""
-
-Put = Callable[[str, int, bytes, bool], bool]
-"""Hands a message to the recorder: topic, log time, bytes, whether it is small and must not be lost; False if it was refused."""
-
-
-@dataclass(slots=True)
-class LidarCounts:
-    """What became of everything that arrived at the lidar's ports since the start."""
-
-    received: int = 0
-    good: int = 0
-    """Data packets of the lidar, recorded or not."""
-    kept: int = 0
-    recording: bool = True
-    not_armed: int = 0
-    """Good ones not recorded, because the vehicle was not armed."""
-    masked_packets: int = 0
-    masked_blocks: int = 0
-    kernel_drops: int = 0
-    queue_drops: int = 0
-    position_received: int = 0
-    position_kept: int = 0
-    position_kernel_drops: int = 0
-    position_queue_drops: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-    """By reason."""
-    newest_ns: int = 0
-    """Log time of the newest good data packet [ns]."""
-    pps: int = 0
-    """The newest position packet's PPS state; what it means is in hdl32e.PpsState."""
-    nmea: str = ""
-    """The newest position packet's sentence."""
-    position_ns: int = 0
-    """Log time of that packet [ns]."""
-    sensor: str = ""
-    """Address of the lidar, once it is known."""
-
 
 _NOTHING: Final = LidarAccount()
 _GOOD_KINDS: Final = frozenset({0, *(mode | hdl32e.PRODUCT_ID << 8 for mode in hdl32e.ReturnMode if mode)})
@@ -147,13 +107,6 @@ class LidarPort(Worker):
         super().__init__("lidar")
         self.counts = LidarCounts()
         self._wanted, self._handed_over = wanted, handed_over
-        self._sensor = None if config.sensor is None else address_number(config.sensor)
-        self._is_pinned = config.sensor is not None
-        self._only_interface = config.interface if config.only_interface else None
-        self._interface: int | None = None
-        """Its index, where others are refused; 0: it is not there."""
-        self._is_filtered = False
-        self._heard_ns = time.monotonic_ns()
         self._looks: deque[npt.NDArray[np.uint16]] = deque(maxlen=_LOOKS)
         self.clock = Envelope(HOUR_NS, _STAMP_NS)
         self._clock_due_ns = 0
@@ -183,8 +136,8 @@ class LidarPort(Worker):
             log_time,
             BATCH_NS / NS_PER_S,
         )
-        self._told: set[str] = set()
-        self._open()
+        self._sender = LidarSender(config, self._data.receiver, self._position.receiver)
+        self._position_packets = PositionPackets(self.counts, put, wanted)
 
     def _pause_for_buffer(self, poll_s: float, asked_bytes: int) -> float:
         """Longest pause between polls that the receive buffer can bridge; a small buffer is reported."""
@@ -213,7 +166,7 @@ class LidarPort(Worker):
                 now_ns = time.monotonic_ns()
                 self._poll(self._position, self._close_position)
                 self._handed_over()
-                self._watch_sensor(now_ns)
+                self._sender.watch(now_ns)
                 self.progress()
                 if found:
                     self._pause_s = self._next_pause_s(found, now_ns - before_ns)
@@ -248,8 +201,6 @@ class LidarPort(Worker):
             close(batch)
         return found
 
-    # The sensor and others ----------------------------------------------------------------------------------------
-
     def view(self) -> SensorView | None:
         """How the lidar is set, by the packets since the last call; None: there were none."""
         looks, self._looks = self._looks, deque(maxlen=_LOOKS)
@@ -257,58 +208,22 @@ class LidarPort(Worker):
             return None
         return view(np.frombuffer(self._newest, SCAN_PACKET_DTYPE)["data"], sectors_seen(np.concatenate(looks)))
 
-    def _adopt(self, sources: npt.NDArray[np.uint32]) -> None:
-        """Take the sender of most good packets for the lidar, and have the kernel refuse all others."""
-        addresses, counts = np.unique(sources, return_counts=True)
-        self._sensor = int(addresses[np.argmax(counts)])
-        _log.info("the lidar is at %s", address_text(self._sensor))
-
     def _heard(self, packets: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
         """Note good packets of the lidar."""
-        assert self._sensor is not None
-        self._heard_ns = time.monotonic_ns()
+        heard_ns = self._sender.heard()
+        self.counts.sensor = self._sender.text
         self._newest = packets[-1:].tobytes()
         self._looks.append(packets["data"]["blocks"]["azimuth"][:, 0].copy())
         self.counts.good += len(packets)
         self.counts.newest_ns = int(time_ns[-1])
-        if self._heard_ns >= self._clock_due_ns:
-            self._clock_due_ns = self._heard_ns + _CLOCK_NS
+        if heard_ns >= self._clock_due_ns:
+            self._clock_due_ns = heard_ns + _CLOCK_NS
             stamp_ns = packets["data"]["stamp_us"].astype(np.int64) * NS_PER_US
             first = int(np.argmax(stamp_ns - time_ns))  # the one that was on its way the shortest
             self.clock.add(int(time_ns[first]), int(stamp_ns[first]))
-        if not self._is_filtered:
-            self._is_filtered = True
-            self.counts.sensor = address_text(self._sensor)
-            self._data.receiver.filter(hdl32e.DATA_BYTES, self._sensor, self._interface)
-            self._position.receiver.filter(hdl32e.POSITION_BYTES, self._sensor, self._interface)
 
-    def _open(self) -> None:
-        """Let in what comes by the lidar's interface, whatever it is; without a name for that, everything."""
-        if self._only_interface is None:
-            self._data.receiver.unfilter()
-            self._position.receiver.unfilter()
-            return
-        try:
-            index = socket.if_nametoindex(self._only_interface)
-        except OSError:
-            index = 0
-        for batch in (self._data, self._position):
-            batch.receiver.filter(interface=index)
-        if not index and self._interface != 0:
-            _log.error("network interface %s is not there, and only what comes by it is let in", self._only_interface)
-        self._interface = index
-
-    def _watch_sensor(self, now_ns: int) -> None:
-        """Let everything in while the lidar is silent, to tell why it is."""
-        silent_ns = now_ns - self._heard_ns
-        if self._is_filtered and silent_ns > _OPEN_NS:
-            self._is_filtered = False
-            self._open()
-        elif not self._is_filtered and self._only_interface is not None:
-            self._open()  # it may have come, or come back with another index
-        if self._sensor is not None and not self._is_pinned and silent_ns > _FORGET_NS:
-            _log.warning("the lidar at %s is silent; it may come back from another address", self.counts.sensor)
-            self._sensor = None
+    def _close_position(self, batch: Batch) -> None:
+        self._position_packets.close(batch, self._sender.address)
 
     # Data packets -------------------------------------------------------------------------------------------------
 
@@ -319,8 +234,8 @@ class LidarPort(Worker):
         if not len(packets) and not drops and not refused:
             return
         fresh = LidarAccount(received=refused, rejected_sender=refused, kernel_drops=drops)
-        self._reject(lidarstate.REFUSED, refused)
-        if not batch.receiver.all_are(len(packets), hdl32e.DATA_BYTES, self._sensor) or not self._fields.good(
+        self.counts.reject(lidarstate.REFUSED, refused)
+        if not batch.receiver.all_are(len(packets), hdl32e.DATA_BYTES, self._sender.address) or not self._fields.good(
             len(packets)
         ):
             packets, time_ns, fresh = self._sort(packets, sizes, time_ns, sources, fresh)
@@ -346,11 +261,11 @@ class LidarPort(Worker):
         good = right_size & hdl32e.is_data(packets["data"])
         if not good.all():
             self._tell_foreign(packets["data"][right_size & ~good])
-        if self._sensor is None and good.any():
-            self._adopt(sources[good])
-        ours = good & (sources == (self._sensor or 0))
+        if self._sender.address is None and good.any():
+            self._sender.adopt(sources[good])
+        ours = good & (sources == (self._sender.address or 0))
         strangers = int((good & ~ours).sum())
-        self._reject(lidarstate.WRONG_SENDER, strangers)
+        self.counts.reject(lidarstate.WRONG_SENDER, strangers)
         account = replace(
             account,
             received=account.received + len(packets) - int(ours.sum()),
@@ -400,55 +315,14 @@ class LidarPort(Worker):
         counts.masked_blocks += account.masked_blocks
         counts.kernel_drops += account.kernel_drops
         counts.queue_drops += account.queue_drops
-        self._reject(lidarstate.WRONG_LENGTH, account.rejected_length)
+        self.counts.reject(lidarstate.WRONG_LENGTH, account.rejected_length)
 
     def _tell_foreign(self, packets: npt.NDArray[np.void]) -> None:
         """Name what has a data packet's length and is none of an HDL-32E."""
         flagged = (packets["blocks"]["flag"] == hdl32e.BLOCK_FLAG).all(axis=1)
         taller = hdl32e.is_hdl64e(packets)
-        self._reject(f"{lidarstate.WRONG_MODEL}: {hdl32e.HDL_64E}", int(taller.sum()))
-        self._reject(lidarstate.WRONG_CONTENT, int((~flagged & ~taller).sum()))
+        self.counts.reject(f"{lidarstate.WRONG_MODEL}: {hdl32e.HDL_64E}", int(taller.sum()))
+        self.counts.reject(lidarstate.WRONG_CONTENT, int((~flagged & ~taller).sum()))
         for product, count in Counter(packets["product"][flagged].tolist()).items():
             name = hdl32e.OTHER_PRODUCTS.get(product, f"unknown return mode or product 0x{product:02x}")
-            self._reject(f"{lidarstate.WRONG_MODEL}: {name}", count)
-
-    def _reject(self, reason: str, count: int) -> None:
-        if not count:
-            return
-        self.counts.rejected[reason] += count
-        if reason not in self._told:
-            self._told.add(reason)
-            _log.warning("rejected from now on, and counted: %s", reason)
-
-    # Position packets ---------------------------------------------------------------------------------------------
-
-    def _close_position(self, batch: Batch) -> None:
-        packets, sizes, time_ns, sources = batch.take()
-        drops, refused = batch.new_drops()
-        self.counts.position_kernel_drops += drops
-        self._reject("position " + lidarstate.REFUSED, refused)
-        if not len(packets):
-            return
-        right_size = sizes == hdl32e.POSITION_BYTES
-        good = right_size & hdl32e.is_position(packets)
-        self._reject("position packet of a wrong length", int((~right_size).sum()))
-        self._reject("position packet with other content", int((right_size & ~good).sum()))
-        self.counts.position_received += len(packets)
-        if self._sensor is not None:
-            strangers = good & (sources != self._sensor)
-            self._reject("position packet from another sender than the lidar", int(strangers.sum()))
-            good &= ~strangers
-        kept, kept_ns = fovmask.select(packets, good), time_ns[good]
-        if not len(kept):
-            return
-        stamp_ns = int(kept_ns[-1])
-        self.counts.pps = int(kept["pps"][-1])
-        self.counts.nmea = clean_bytes(bytes(kept["nmea"][-1]))
-        self.counts.position_ns = stamp_ns
-        if not self._wanted():
-            return
-        chunks = [(stamp, packet.tobytes()) for stamp, packet in zip(kept_ns.tolist(), kept, strict=True)]
-        if self._put(records.POSITION.topic, stamp_ns, records.encode_raw(stamp_ns, chunks, "velodyne"), False):
-            self.counts.position_kept += len(kept)
-        else:
-            self.counts.position_queue_drops += len(kept)
+            self.counts.reject(f"{lidarstate.WRONG_MODEL}: {name}", count)

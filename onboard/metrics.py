@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
-from onboard.health import Status, Verdict
+from onboard.health import Verdict
 from onboard.lidarstate import State
+from onboard.status import Status
 
 _SPACES: Final = ("room", "low", "full")
 _ESCAPES: Final = {"\\": "\\\\", '"': '\\"', "\n": "\\n"}

@@ -14,11 +14,12 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SourceError, UsageError
 from flightlog.mavlink import FrameParser, decode
-from onboard.autopilot import COMPONENT, LinkCounts, note_frames
 from onboard.config import LinkConfig
+from onboard.linkcounts import LinkCounts, note_frames
 from onboard.parameters import NAME_BYTES, Difference, as_single
 from onboard.sources import Source, open_source
 from onboard.timesync import LogTime, read_clocks
+from onboard.voice import COMPONENT
 
 _TRIES: Final = 6
 _WAIT_S: Final = 0.8

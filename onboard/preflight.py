@@ -12,15 +12,17 @@ from typing import Final
 
 from flightlog.errors import SourceError, SwathError
 from flightlog.mount import load_mount
-from onboard.autopilot import Link, streams_asked
+from onboard.autopilot import Link
 from onboard.config import LidarConfig, LinkConfig, RecorderConfig, SwathdConfig
-from onboard.health import LOW_RATE, Level, LidarStatus
+from onboard.health import LOW_RATE, Level
 from onboard.lidar import LidarPort
 from onboard.lidar_settings import LidarSettings
 from onboard.lidarstate import REMEDY, State
 from onboard.parameter_link import ParameterLink
 from onboard.parameters import GENERATION_MARKS, compare, generation, shipped
 from onboard.readings import LidarReadings, Rates
+from onboard.requester import streams_asked
+from onboard.status import LidarStatus
 from onboard.timesync import LogTime, read_clocks
 
 _RMEM_MAX: Final = Path("/proc/sys/net/core/rmem_max")

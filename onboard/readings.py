@@ -11,13 +11,16 @@ from typing import Final
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.nmea import parse_rmc
 from flightlog.records import ClockSync
-from onboard import lidarstate
-from onboard.autopilot import LinkCounts
+from onboard import lidarstate, logfolder
 from onboard.clocksync import utc_of_lidar
-from onboard.health import ClockStatus, LidarStatus, LinkStatus
+from onboard.config import RecorderConfig
+from onboard.leftovers import Salvager
 from onboard.lidar import LidarPort
+from onboard.linkcounts import LinkCounts
 from onboard.packetfilter import address_number
+from onboard.recorder import Recorder
 from onboard.sensorview import SensorView
+from onboard.status import ClockStatus, LidarStatus, LinkStatus, RecorderStatus
 
 _THERMAL: Final = Path("/sys/class/thermal")
 _RATE_SECONDS: Final = 3
@@ -211,6 +214,51 @@ class Endurance:
             return None
         rate = (then_bytes - free_bytes) / (time_s - then_s)
         return round(max(0, free_bytes - floor_bytes) / rate / 60, 1)
+
+
+class RecorderReadings:
+    """The recorder's part of the status.
+
+    Parameters
+    ----------
+    recorder : Recorder
+    salvager : Salvager
+    config : RecorderConfig
+    """
+
+    def __init__(self, recorder: Recorder, salvager: Salvager, config: RecorderConfig) -> None:
+        self._recorder, self._salvager, self._config = recorder, salvager, config
+        self._endurance = Endurance()
+
+    def status(self, now_ns: int) -> RecorderStatus:
+        """To be asked once a second; `now_ns` is the monotonic clock."""
+        counts, backlog = self._recorder.counts, self._recorder.backlog
+        leftover = self._salvager.counts
+        try:
+            free_bytes = logfolder.free_bytes(Path(counts.directory or self._config.directory))
+        except OSError:  # the folder is gone; the recorder says so
+            free_bytes = 0
+        floor_bytes = self._config.min_free_mb << 20
+        return RecorderStatus(
+            segment=counts.segment,
+            messages=counts.messages,
+            bytes_on_disk=counts.bytes_on_disk,
+            backlog_bytes=backlog.size_bytes,
+            refused=backlog.refused,
+            sync_age_s=(now_ns - counts.last_sync_ns) / NS_PER_S,
+            slowest_sync_ms=counts.slowest_sync_ms,
+            free_bytes=free_bytes,
+            minutes_left=self._endurance.minutes(now_ns / NS_PER_S, free_bytes, floor_bytes),
+            segments=counts.segments,
+            space=counts.space.value,
+            refused_for_space=counts.refused_for_space,
+            lost_on_disk=counts.lost_on_disk,
+            trouble=counts.trouble,
+            abandoned=counts.abandoned,
+            leftovers=leftover.found,
+            leftovers_mended=leftover.mended,
+            leftovers_left=leftover.left,
+        )
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The flight log's writer: a bounded backlog on which no receiver waits, and segments synced to disk twice a second.
+"""The flight log's writer: from the backlog, on which no receiver waits, to segments synced to disk twice a second.
 
 A segment that somebody deleted or moved, a folder that is gone, a disk that fails or turns read-only: the segment is given up,
 and recording begins anew, in another folder if the configuration names one. Data that arrive meanwhile wait in the
@@ -17,12 +17,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from flightlog import records
 from flightlog.constants import NS_PER_MS, NS_PER_S
 from flightlog.errors import LogError
 from onboard import logfolder
+from onboard.backlog import Backlog, Item
 from onboard.config import RecorderConfig
 from onboard.journal import event
 from onboard.logfolder import Space
@@ -31,17 +32,11 @@ from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
 
-_RESERVE_BYTES: Final = 4 << 20
-"""Room of the backlog beyond its limit that only small messages may use, so that a stalled disk costs lidar packets first."""
 
-
-_TAKE_BYTES: Final = 1 << 20
 _NEARLY: Final = (7, 8)
 """A sync is nearly due when this part of the time to it has passed."""
 _SLICE_NS: Final = 100 * NS_PER_MS
 """Writing goes on for at least this long between two syncs, however late the last one was."""
-_PRESSING: Final = 4
-"""The backlog presses when it has grown to this part of its limit."""
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _RETRY_NS: Final = 5 * NS_PER_S
 """Between two attempts to open a segment on a full disk."""
@@ -50,53 +45,6 @@ _TROUBLE_NS: Final = NS_PER_S
 _CLOSER_TICK_S: Final = 0.2
 _LIDAR: Final = frozenset((records.LIDAR.topic, records.POSITION.topic))
 """What is not recorded when space is low."""
-
-
-class _Item(NamedTuple):
-    topic: str
-    log_time_ns: int
-    data: bytes
-
-
-class Backlog:
-    """What the disk has not taken yet, bounded by its size in memory.
-
-    Parameters
-    ----------
-    limit_bytes : int
-    """
-
-    def __init__(self, limit_bytes: int) -> None:
-        self._limit_bytes = limit_bytes
-        self._items: deque[_Item] = deque()
-        self._lock = threading.Lock()
-        self.size_bytes = 0
-        self.refused = 0
-        self.pressing = threading.Event()
-        """Set when the writer should not wait any longer."""
-
-    def put(self, topic: str, log_time_ns: int, data: bytes, vital: bool) -> bool:
-        """Append a message; False if there is no room. A vital one may use the reserve."""
-        with self._lock:
-            if self.size_bytes + len(data) > self._limit_bytes + (_RESERVE_BYTES if vital else 0):
-                self.refused += 1
-                return False
-            self._items.append(_Item(topic, log_time_ns, data))
-            self.size_bytes += len(data)
-        if self.size_bytes > self._limit_bytes // _PRESSING:
-            self.pressing.set()
-        return True
-
-    def get(self) -> list[_Item]:
-        """Take the oldest messages, about a megabyte of them."""
-        out: list[_Item] = []
-        with self._lock:
-            size = 0
-            while self._items and size < _TAKE_BYTES:
-                out.append(self._items.popleft())
-                size += len(out[-1].data)
-            self.size_bytes -= size
-        return out
 
 
 @dataclass(slots=True)
@@ -152,7 +100,7 @@ class Recorder(Worker):
         self._told_drops = 0
         self._segment: Segment | None = None
         self._closer: threading.Thread | None = None
-        self._taken: deque[_Item] = deque()
+        self._taken: deque[Item] = deque()
         self._sync_soon = False
         self.backlog = Backlog(config.backlog_mb << 20)
         self.counts = RecorderCounts(last_sync_ns=time.monotonic_ns())

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from flightlog import records
 from flightlog.hdl32e import AZIMUTH_STEPS, DATA_BYTES
 from onboard.config import DownlinkConfig
-from onboard.health import DownlinkStatus
+from onboard.status import DownlinkStatus
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)

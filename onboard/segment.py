@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, Final, cast
 from flightlog import __version__
 from flightlog.constants import NS_PER_S
 from flightlog.errors import LogError
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 from onboard import logfolder
 from onboard.logfolder import READ_ONLY, Entry, sync_directory
 

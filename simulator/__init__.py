@@ -17,9 +17,13 @@ plans, flights/                            named flights: scene, route, duration
 materials, meshes, parts, buildings        reflectances at 905 nm; shapes as triangles; houses
 scene, ground, town, lake                  the named scenes
 route, flight                              where to fly; position, attitude and rates at any time
-rays, moving, echoes, lidar, telemetry     beams against triangles; cars and people; echoes of a beam; data packets; position packets
+rays, echoes, lidar, telemetry             beams against triangles; echoes of a beam; data packets; position packets
+moving, boxes                              cars and people, on ways of their own; beams that meet them
 imu, ins, autopilot                        constant errors of inertial sensors; what the INS believes; what it says over MAVLink
 boardlog                                   what it writes on its own card
-faults, capture, truth, render             what goes wrong; pcap and tlog; truth files; the chunks in order
+faults, capture, truth                     what goes wrong; pcap and tlog; truth files
+simulation, recording, render              all of one job; its files while they are written; from start to end
+cameras, photographs, rigfile, checkpoints what a camera is; its images; rig.yaml; surveyed points and panels
+outdoors, powerline                        clouds with known truth, without a flight
 play, command                              live to UDP and a pty; `swath simulate`
 """

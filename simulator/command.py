@@ -68,7 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     from simulator import cameras, plans
     from simulator.config import Options
     from simulator.play import Target, play
-    from simulator.render import CAPTURE, TLOG, Job, render
+    from simulator.recording import CAPTURE, TLOG
+    from simulator.render import render
+    from simulator.simulation import Job
 
     if arguments.sample_config:
         print(config.sample(Options), end="")
@@ -113,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _claim(arguments: argparse.Namespace, plan: "Plan") -> None:
     """Refuse to write over a flight that is there, and options that would not be used."""
     from flightlog.errors import UsageError
-    from simulator.render import FILES, IMAGES, POINTS, RTK
+    from simulator.recording import FILES, IMAGES, POINTS, RTK
 
     more = {POINTS: arguments.truth_points, IMAGES: bool(plan.cameras), RTK: plan.options.rtk.hz > 0}
     for name in (*FILES, *(name for name, made in more.items() if made)):

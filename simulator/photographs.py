@@ -22,20 +22,16 @@ from simulator.grid import on_grid
 from simulator.optics import EQUIDISTANT, rays
 from simulator.parts import World
 from simulator.rays import Surfaces
-from simulator.textures import BANDS, SKY, TABLE_OF_LOOKS, TEMPERATURE, appearance, is_panel, light
+from simulator.rigfile import KELVIN, KELVIN_STEP, angles_deg, entry
+from simulator.textures import BANDS, SKY, TABLE_OF_LOOKS, TEMPERATURE, appearance, light
 
 Array = npt.NDArray[np.float64]
 
 WHITE: Final = 0.7
 """Albedo in full sun that fills the scale at an exposure of 1."""
-_KELVIN: Final = 273.15
-_KELVIN_STEP: Final = 0.01
 _ROWS: Final = 32
 _EXPOSURE_S: Final = 1.0 / 1250.0
 _ISO, _F_NUMBER = 100, 4.0
-CHECKS: Final = 20
-_MARK_SIGMA_PX: Final = 0.3
-_CHECK_SIGMA_M: Final = 0.005
 _STEP_M: Final = 10.0
 
 
@@ -58,7 +54,7 @@ class Studio:
         self, world: World, surfaces: Surfaces, flight: Flight, cameras: tuple[Camera, ...], clocks: Clocks, origin: Origin, seed: int
     ) -> None:  # fmt: skip
         self.world, self.flight, self.cameras, self.clocks, self.origin = world, flight, cameras, clocks, origin
-        self._surfaces, self._seed = surfaces, seed
+        self.surfaces, self.seed = surfaces, seed
         self.exposures = exposures(cameras, flight.duration_s)
 
     def name_of(self, one: Exposure) -> str:
@@ -92,10 +88,10 @@ class Studio:
             directions = np.empty((len(mats) * o.width_px * per_pixel, 3))
             rays(fish_eye, numbers, first, mats, o.width_px, o.samples, directions)
             origins = np.repeat(place[first : first + _ROWS], o.width_px * per_pixel, axis=0).astype(np.float32)
-            hits = self._surfaces.opaque(origins, directions.astype(np.float32))
+            hits = self.surfaces.opaque(origins, directions.astype(np.float32))
             values = np.empty((len(mats) * o.width_px, len(bands)))
             light(
-                origins, directions, hits, self._surfaces.planes, self.world.material, 1.0 / numbers[0], SKY, TABLE_OF_LOOKS,
+                origins, directions, hits, self.surfaces.planes, self.world.material, 1.0 / numbers[0], SKY, TABLE_OF_LOOKS,
                 bands, values,
             )  # fmt: skip
             out[first : first + _ROWS] = values.reshape(len(mats), o.width_px, len(bands))
@@ -103,17 +99,17 @@ class Studio:
 
     def exposure_of(self, one: Exposure) -> float:
         """Factor of an image's exposure time."""
-        rng = generator(self._seed, f"exposure {self.cameras[one.camera].name}", one.number)
+        rng = generator(self.seed, f"exposure {self.cameras[one.camera].name}", one.number)
         return float(np.exp(self.cameras[one.camera].options.exposure_spread * rng.standard_normal()))
 
     def picture(self, one: Exposure) -> npt.NDArray[Any]:
         """Numbers of the sensor: of 8 bit with three bands, of 16 with one."""
         o = self.cameras[one.camera].options
-        rng = generator(self._seed, f"pixels {self.cameras[one.camera].name}", one.number)
+        rng = generator(self.seed, f"pixels {self.cameras[one.camera].name}", one.number)
         seen = self.light(one)
         if o.bands == (BANDS[TEMPERATURE],):
             noisy = seen[:, :, 0] + o.temperature_noise_k * rng.standard_normal(seen.shape[:2])
-            return np.clip(np.rint((noisy + _KELVIN) / _KELVIN_STEP), 0, 65535).astype(np.uint16)
+            return np.clip(np.rint((noisy + KELVIN) / KELVIN_STEP), 0, 65535).astype(np.uint16)
         share = self.exposure_of(one) / WHITE * seen * _falloff(o.vignetting, seen.shape)[:, :, None]
         share = o.black_level + (1.0 - o.black_level) * np.clip(share, 0.0, 1.0)
         if o.transfer == "srgb":
@@ -149,7 +145,7 @@ class Studio:
         return exif
 
     def write_all(self, folder: Path, workers: int, progress: Callable[[float], object] | None = None) -> None:
-        """All images, `rig.yaml`, `control.csv`, `marks.csv`, and below `truth/` the poses and the rig as they are."""
+        """All images, `rig.yaml`, and below `truth/` the poses and the rig as they are."""
         (folder / "truth").mkdir(parents=True)
         with ThreadPoolExecutor(workers) as pool:
             for _ in pool.map(lambda one: self.write(one, folder), self.exposures):
@@ -158,19 +154,14 @@ class Studio:
         for path, believed in ((folder / "rig.yaml", True), (folder / "truth" / "rig.yaml", False)):
             path.write_text(yaml.safe_dump(self.rig(believed), sort_keys=False), encoding="utf-8")
         (folder / "truth" / "poses.csv").write_text(self._poses_table(), encoding="utf-8")
-        control, marks, panels = self._checks()
-        (folder / "control.csv").write_text(control, encoding="utf-8")
-        (folder / "marks.csv").write_text(marks, encoding="utf-8")
-        if panels:
-            (folder / "panels.csv").write_text(panels, encoding="utf-8")
 
     def rig(self, believed: bool = True) -> dict[str, Any]:
         """As rig.yaml holds it, in Kalibr's terms: as it is believed to be, or as it is."""
-        return {camera.name: _entry(camera, believed, len(self.cameras) > 1) for camera in self.cameras}
+        return {camera.name: entry(camera, believed, len(self.cameras) > 1) for camera in self.cameras}
 
     def truth(self) -> dict[str, Any]:
         """What truth.json says of the cameras."""
-        turned = {c.name: _angles_deg(c.mat_cam_ins @ c.believed_mat.T) for c in self.cameras}
+        turned = {c.name: angles_deg(c.mat_cam_ins @ c.believed_mat.T) for c in self.cameras}
         return {
             c.name: {
                 "boresight_deg": turned[c.name], "position_m": c.position_m.tolist(), "focal_px": c.lens.focal_px,
@@ -181,7 +172,8 @@ class Studio:
             for c in self.cameras
         }  # fmt: skip
 
-    def _grid(self, points_m: Array) -> Array:
+    def on_grid(self, points_m: Array) -> Array:
+        """Grid east, north and height above mean sea level of places, shape (n, 3)."""
         latitude, longitude, height = geodetic(points_m, self.origin)
         return np.column_stack([*on_grid(latitude, longitude), height])
 
@@ -195,7 +187,7 @@ class Studio:
             angles = np.degrees(
                 [np.arctan2(-look[1, 2], look[2, 2]), np.arcsin(look[0, 2]), np.arctan2(-look[0, 1], look[0, 0])]
             )
-            east, north, up = self._grid(place)[0]
+            east, north, up = self.on_grid(place)[0]
             utc_ns = int(self.clocks.utc.shows_ns(one.time_s))
             words = ",".join(f"{angle:.7f}" for angle in angles)
             lines.append(f"{self.name_of(one)},{utc_ns},{east:.5f},{north:.5f},{up:.5f},{words}")
@@ -204,58 +196,9 @@ class Studio:
     def _grid_axes(self, place_m: Array) -> Array:
         """Grid east, grid north and up at a place in the local frame, as columns: the rotation in the coordinates' derivatives."""
         steps = _STEP_M * np.eye(3)
-        slope = (self._grid(place_m + steps) - self._grid(place_m - steps)).T / (2.0 * _STEP_M)
+        slope = (self.on_grid(place_m + steps) - self.on_grid(place_m - steps)).T / (2.0 * _STEP_M)
         u, _, v = np.linalg.svd(slope)
         return np.asarray((u @ v).T)
-
-    def _checks(self) -> tuple[str, str, str]:
-        """Surveyed points on open ground that several images see, their marks in the images, and the panels with what is true of them."""
-        rng = generator(self._seed, "check points")
-        chosen = self._seen_spots(rng)
-        names = [f"check{n + 1}" for n in range(len(chosen))]
-        grid = self._grid(chosen) if len(chosen) else np.empty((0, 3))
-        control = ["name,x,y,z,sigma,use"]
-        control += [
-            f"{name},{x:.4f},{y:.4f},{z:.4f},{_CHECK_SIGMA_M},check"
-            for name, (x, y, z) in zip(names, grid, strict=True)
-        ]
-        marks = ["image,point,x_px,y_px,sigma"]
-        for one in self.exposures:
-            pixels = self.pixels_of(one, chosen)
-            for name, pixel in zip(names, pixels, strict=True):
-                if np.isfinite(pixel).all():
-                    x, y = pixel + _MARK_SIGMA_PX * rng.standard_normal(2)
-                    marks.append(f"{self.name_of(one)},{name},{x:.3f},{y:.3f},{_MARK_SIGMA_PX}")
-        return "\n".join(control) + "\n", "\n".join(marks) + "\n", self._panels()
-
-    def _seen_spots(self, rng: np.random.Generator) -> Array:
-        """Places, shape (n, 3), that three images or more see, far from each other."""
-        centres = np.array(
-            [self.poses(self.cameras[one.camera], np.array([one.time_s]))[0][0] for one in self.exposures]
-        )
-        if not len(centres):
-            return np.empty((0, 3))
-        low, high = centres[:, :2].min(axis=0), centres[:, :2].max(axis=0)
-        tried = np.column_stack(
-            [rng.uniform(low - 5.0, high + 5.0, (40 * CHECKS, 2)), np.full(40 * CHECKS, centres[:, 2].max())]
-        )
-        down = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(tried), 1))
-        hits = self._surfaces.opaque(tried.astype(np.float32), down)
-        tried, hits = tried[hits >= 0], hits[hits >= 0]
-        planes = self._surfaces.planes[hits]
-        flat = np.abs(planes[:, 2]) > 0.9
-        tried, planes = tried[flat], planes[flat]
-        tried[:, 2] = (planes[:, 3] - np.einsum("ni,ni->n", planes[:, :2], tried[:, :2])) / planes[:, 2]
-        seen = np.zeros(len(tried), np.int64)
-        for one in self.exposures:
-            seen += np.isfinite(self.pixels_of(one, tried)).all(axis=1)
-        good = tried[seen >= 3]
-        apart = 0.6 * float(np.sqrt(np.prod(high - low + 10.0) / CHECKS))
-        kept: list[Array] = []
-        for place in good:
-            if len(kept) < CHECKS and all(np.linalg.norm(place[:2] - other[:2]) > apart for other in kept):
-                kept.append(place)
-        return np.array(kept).reshape(-1, 3)
 
     def pixels_of(self, one: Exposure, points_m: Array) -> Array:
         """Where an image shows places, shape (n, 2), its shutter rolling; not a number where it does not see them."""
@@ -271,30 +214,14 @@ class Studio:
         away = points_m - place
         distance = np.linalg.norm(away, axis=1)
         unit = away / distance[:, None]
-        hits = self._surfaces.opaque(place.astype(np.float32), unit.astype(np.float32))
-        planes = self._surfaces.planes[hits]
+        hits = self.surfaces.opaque(place.astype(np.float32), unit.astype(np.float32))
+        planes = self.surfaces.planes[hits]
         with np.errstate(divide="ignore", invalid="ignore"):
             met = (planes[:, 3] - np.einsum("ni,ni->n", planes[:, :3], place)) / np.einsum(
                 "ni,ni->n", planes[:, :3], unit
             )
         open_ = inside & (hits >= 0) & (np.abs(met - distance) < 0.03)
         return np.where(open_[:, None], pixels, np.nan)
-
-    def _panels(self) -> str:
-        """Panels that lie flat: place, radius and reflectance; empty where there are none."""
-        world = self.world
-        flat = is_panel(world.material) & (np.abs(world.normals()[:, 2]) > 0.99)
-        lines = []
-        for surface in np.unique(world.surface[flat]):
-            own = flat & (world.surface == surface)
-            corners = world.triangles_m[own].reshape(-1, 3)
-            radius = 0.4 * float((corners.max(axis=0) - corners.min(axis=0))[:2].min())
-            middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
-            x, y, z = self._grid(middle[None])[0]
-            values = TABLE_OF_LOOKS[world.material[own][0]]
-            numbers = ",".join(f"{values[BANDS.index(band)]:.3f}" for band in ("red", "green", "blue", "nir"))
-            lines.append(f"{world.names[surface].replace(',', ' ')},{x:.3f},{y:.3f},{z:.3f},{radius:.2f},{numbers}")
-        return "\n".join(["name,x,y,z,radius,red,green,blue,nir", *lines]) + "\n" if lines else ""
 
     def albedo(self, points_m: Array, material: npt.NDArray[np.uint8], bands: tuple[str, ...]) -> Array:
         """True albedo, or degrees, of places of some material, shape (n, b)."""
@@ -311,52 +238,3 @@ def _falloff(vignetting: tuple[float, float, float], shape: tuple[int, ...]) -> 
     r2 = ((x - (width - 1) / 2) ** 2 + (y - (height - 1) / 2) ** 2) / (((width - 1) / 2) ** 2 + ((height - 1) / 2) ** 2)
     a, b, c = vignetting
     return np.asarray(np.maximum(1.0 + r2 * (a + r2 * (b + r2 * c)), 0.05))
-
-
-def _entry(camera: Camera, believed: bool, several: bool) -> dict[str, Any]:
-    """A camera of rig.yaml."""
-    o = camera.options
-    lens, mat = (camera.believed, camera.believed_mat) if believed else (camera.lens, camera.mat_cam_ins)
-    place = np.array(o.position_m) if believed else camera.position_m
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = mat, -mat @ place
-    coefficients = [*lens.coefficients, *[0.0] * (4 - len(lens.coefficients))]
-    entry: dict[str, Any] = {
-        "camera_model": "pinhole",
-        "intrinsics": [lens.focal_px, lens.focal_px, *lens.centre_px],
-        "distortion_model": lens.model,
-        "distortion_coeffs": [float(value) for value in coefficients],
-        "resolution": [o.width_px, o.height_px],
-        "T_cam_imu": transform.tolist(),
-        "timeshift_cam_imu": 0.0 if believed else -o.clock_offset_s,
-        "line_delay_s": o.line_delay_s * (o.line_delay_known if believed else 1.0),
-        "bands": list(o.bands),
-        "vignetting": list(o.vignetting),
-    }
-    if o.bands == (BANDS[TEMPERATURE],):
-        entry["response"] = {"scale": _KELVIN_STEP, "offset": -_KELVIN}
-    else:
-        entry["response"] = o.transfer
-        if o.black_level:
-            entry["black_level"] = o.black_level * (255.0 if len(o.bands) == 3 else 65535.0)
-    if several:
-        entry["image_prefix"] = f"{camera.name}_"
-    if believed:
-        free = ["f", "pu", "pv", "k1", "k2"] + (["p1", "p2"] if lens.model != EQUIDISTANT else [])
-        entry["estimate"] = free
-        entry["sigma"] = {
-            "f": max(o.focal_spread_px, 0.1), "pu": max(o.centre_spread_px, 0.1), "pv": max(o.centre_spread_px, 0.1),
-            "boresight_deg": max(o.boresight_spread_deg, 0.01), "lever_arm_m": max(o.lever_spread_m, 0.001), "timeshift_s": 0.1,
-        }  # fmt: skip
-        if o.line_delay_known != 1.0:
-            entry["sigma"]["line_delay_s"] = abs(o.line_delay_known - 1.0) * o.line_delay_s
-    return entry
-
-
-def _angles_deg(mat: Array) -> list[float]:
-    """Rotation vector of a rotation of less than half a turn."""
-    sines = 0.5 * np.array([mat[2, 1] - mat[1, 2], mat[0, 2] - mat[2, 0], mat[1, 0] - mat[0, 1]])
-    sine = float(np.linalg.norm(sines))
-    angle = float(np.arctan2(sine, (np.trace(mat) - 1.0) / 2.0))
-    x, y, z = np.degrees(sines * (angle / sine if sine > 0.0 else 1.0))
-    return [float(x), float(y), float(z)]

@@ -68,7 +68,8 @@ class Simulated:
 
 def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int, points: bool) -> None:
     """All files of a simulation, with the lidar's data packets of one 0.1 s in `every` only: rays are what costs."""
-    from simulator.render import BOARD, CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Job, Recording, Simulation
+    from simulator.recording import BOARD, CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Recording
+    from simulator.simulation import Job, Simulation
     from simulator.truth import write_json
 
     simulation = Simulation(Job(scene, seconds, seed, folder, options))

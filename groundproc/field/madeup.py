@@ -30,7 +30,7 @@ from flightlog.hdl32e import (
     ReturnMode,
     packet_ns,
 )
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 from flightlog.mount import Mount
 
 Array = npt.NDArray[np.float64]

@@ -17,7 +17,8 @@ from groundproc.flight import autopilot, load, merging, timebase, vehicle
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.boardlog import BoardLogs
 from groundproc.flight.lidar import lidar_of
-from groundproc.flight.load import JUMP_NS, PositionSamples
+from groundproc.flight.load import JUMP_NS
+from groundproc.flight.positionpackets import PositionCollector, PositionSamples, position_samples
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
 from groundproc.flight.vehicle import Choice
@@ -77,7 +78,7 @@ def read_clocks(
         flight = read_flight(readers, link, progress)
         return flight.runs, flight.boots, flight.lidar
     lidar = lidar_of(readers)
-    runs = _runs(readers, load.position_samples(readers, progress), lidar)
+    runs = _runs(readers, position_samples(readers, progress), lidar)
     if not runs:
         raise LogError(_NO_LIDAR.format(readers[0].path))
     return runs, [], lidar
@@ -95,7 +96,7 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
         No lidar packets, or no autopilot, in the logs.
     """
     lidar = lidar_of(readers)
-    parser, samples = FrameParser(), load.PositionCollector(load.first_stamp(readers, lidar))
+    parser, samples = FrameParser(), PositionCollector(load.first_stamp(readers, lidar))
     logs, count, kept, unsigned = BoardLogs(), 0, [], 0
     needs_key = any(link in load.signed_links(reader) for reader in readers)
     for frame in _frames(readers, link, parser, (samples, logs), progress):
@@ -135,7 +136,7 @@ def _frames(
     readers: Sequence[LogReader],
     link: str,
     parser: FrameParser,
-    others: tuple[load.PositionCollector, BoardLogs],
+    others: tuple[PositionCollector, BoardLogs],
     progress: Progress | None,
 ) -> Iterator[Frame]:
     """The frames of a link; position packets and the board's own logs go to `others`, so that the logs are read once for all."""

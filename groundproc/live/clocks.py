@@ -13,7 +13,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mavlink import Frame
 from groundproc.flight import pairing, timebase
-from groundproc.flight.load import Sentence
+from groundproc.flight.positionpackets import Sentence
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import Leg, LidarRun
 from groundproc.live.telemetry import newest_boot

@@ -16,10 +16,13 @@ from flightlog.constants import NS_PER_S
 from flightlog.hdl32e import POSITION_BYTES
 from groundproc import sensors
 from groundproc.flight import load
-from groundproc.flight.load import DeviceClock, PositionBatch
+from groundproc.flight.load import DeviceClock
+from groundproc.flight.positionpackets import PositionBatch, new_sentences
 from groundproc.geodesy import LocalFrame
 from groundproc.live.estimator import Estimator, Options
 from groundproc.live.inbox import Inbox, Received
+from groundproc.live.lag import Lag
+from groundproc.live.pathline import PathLine
 from groundproc.live.place import Figures, Place
 from groundproc.live.products import LiveTrajectory, write_cloud
 from groundproc.live.receivers import Counts
@@ -33,9 +36,7 @@ THIN_S: Final = 0.5
 THIN_MORE_S: Final = 1.0
 SKIP_S: Final = 3.0
 """Behind real time by so much: only every second return is used, every fourth, none."""
-_BIN_NS: Final = 10 * NS_PER_S
 _PAIR_NS: Final = 10_000_000
-_PATH_ROWS: Final = 100_000
 _WAIT_S: Final = 0.02
 
 
@@ -50,54 +51,6 @@ class Source(Protocol):
 
     def counts(self) -> Counts:
         """What did not become data."""
-
-
-class Lag:
-    """How far results are behind the lidar: against the fastest packet of the last minute."""
-
-    def __init__(self) -> None:
-        self._bins: deque[tuple[int, int]] = deque(maxlen=6)
-
-    def arrived(self, device_ns: int, arrival_ns: int) -> None:
-        """Take the newest packet's times: lidar's and this computer's monotonic clock."""
-        number, delay = device_ns // _BIN_NS, arrival_ns - device_ns
-        if self._bins and self._bins[-1][0] == number:
-            self._bins[-1] = (number, min(self._bins[-1][1], delay))
-        else:
-            self._bins.append((number, delay))
-
-    def of(self, device_ns: int, now_ns: int) -> float:
-        """Seconds from a lidar time to now, less what the fastest packet takes; not a number before the first."""
-        if not self._bins:
-            return math.nan
-        return (now_ns - device_ns - min(delay for _, delay in self._bins)) / NS_PER_S
-
-
-class PathLine:
-    """The trajectory for the page: positions, thinned by half whenever there are too many.
-
-    Attributes
-    ----------
-    generation : int
-        Counts how often they were thinned.
-    """
-
-    def __init__(self) -> None:
-        self.generation, self.count, self._every, self._seen = 0, 0, 1, 0
-        self.xyz = np.empty((_PATH_ROWS, 3), np.float32)
-
-    def add(self, position_m: npt.NDArray[np.float64]) -> None:
-        """Append a position, shape (3,)."""
-        self._seen += 1
-        if self._seen % self._every:
-            return
-        if self.count == _PATH_ROWS:
-            self.xyz[: self.count // 2] = self.xyz[: self.count : 2].copy()
-            self.count //= 2
-            self._every *= 2
-            self.generation += 1
-        self.xyz[self.count] = position_m
-        self.count += 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +196,7 @@ class Session:
             return
         self._positions += len(packets)
         readings = velodyne.readings(packets)
-        sentences = load.new_sentences(PositionBatch(readings, receive_ns, device_ns), self._text)
+        sentences = new_sentences(PositionBatch(readings, receive_ns, device_ns), self._text)
         if sentences:
             self._text = sentences[-1].text
             self._estimator.times.hear(sentences)

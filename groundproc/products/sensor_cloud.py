@@ -18,6 +18,7 @@ from groundproc.files import written_aside
 from groundproc.flight import load, timebase
 from groundproc.flight.belonging import in_order_of_one_flight
 from groundproc.flight.lidar import lidar_of
+from groundproc.flight.positionpackets import position_samples
 from groundproc.sensors.shots import Gate, Shots
 
 COLUMNS: Final = ("intensity", "return_number", "number_of_returns", "laser", "azimuth", "range")
@@ -44,7 +45,7 @@ def write_sensor_cloud(logs: Sequence[Path], output: Path, gate: Gate, progress:
     with contextlib.ExitStack() as stack:
         readers = in_order_of_one_flight([stack.enter_context(LogReader(path)) for path in logs])
         fixes = [
-            (s.device_time_ns, fix) for s in load.position_samples(readers).sentences if (fix := nmea.parse_rmc(s.text))
+            (s.device_time_ns, fix) for s in position_samples(readers).sentences if (fix := nmea.parse_rmc(s.text))
         ]
         tie = timebase.lidar_utc(fixes)
         lidar = lidar_of(readers)

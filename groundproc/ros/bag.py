@@ -10,7 +10,8 @@ from typing import Final
 
 from flightlog import __version__
 from flightlog.errors import LogError
-from flightlog.logfile import QOS, LogReader
+from flightlog.logfile import LogReader
+from flightlog.logwriter import QOS
 from flightlog.mcapwriter import McapWriter
 from flightlog.mount import Mount
 from groundproc.estimation import ins, ownsolution

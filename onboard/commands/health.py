@@ -9,8 +9,9 @@ from typing import Final
 
 from flightlog.errors import SwathError
 from flightlog.words import clean
-from onboard import health
+from onboard import health, healthreport
 from onboard.health import Level
+from onboard.status import from_json
 
 HELP = "say how it goes; exit code 0 good, 1 warning, 2 critical"
 
@@ -68,7 +69,7 @@ def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
     """The verdict on a status file, and the text that tells it."""
     try:
         content = path.read_text(encoding="utf-8")
-        status = health.from_json(content, str(path))
+        status = from_json(content, str(path))
     except (OSError, UnicodeDecodeError, SwathError) as error:
         # an unknown state counts as critical, and a monitor reads the exit code
         reason = f"{path}: {error.strerror}; swathd has not run" if isinstance(error, OSError) else str(error)
@@ -84,6 +85,6 @@ def look(path: Path, *, as_json: bool) -> tuple[Level, str]:
         ended = f"swathd (process {status.pid}) has ended; what follows is its last status"
         verdict = health.Verdict(Level.CRITICAL, [ended, *verdict.findings])
     if not as_json:
-        return verdict.level, "\n".join(map(clean, health.report(status, verdict)))
+        return verdict.level, "\n".join(map(clean, healthreport.report(status, verdict)))
     is_armed = health.armed(status, now_ns, boot_id)
     return verdict.level, json.dumps(health.told(verdict, is_armed, json.loads(content)), indent=1)

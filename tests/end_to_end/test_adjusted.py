@@ -11,7 +11,8 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import chi2
 
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods

@@ -16,7 +16,7 @@ import fuzzing
 import pytest
 import seeds
 
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 
 EACH = 3

@@ -18,7 +18,8 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import records
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.accuracy.alignment import best_rigid
 from groundproc.cli import main
 from groundproc.trajectory.table import read_trajectory

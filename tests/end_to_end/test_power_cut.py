@@ -27,7 +27,8 @@ from recording import mounted, recording, run
 
 from flightlog import records
 from flightlog.errors import LogError
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.salvage import salvage
 from onboard import logfolder
 

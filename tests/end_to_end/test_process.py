@@ -18,7 +18,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scipy.spatial.transform import Rotation, Slerp
 
 from flightlog import records
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 from groundproc.trajectory.estimate import FILES
 

@@ -19,7 +19,7 @@ import pytest
 from groundproc.cli import main
 from groundproc.field import pull
 from onboard.daemon import boot_id
-from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status, to_json
+from onboard.status import LidarStatus, LinkStatus, RecorderStatus, Status, to_json
 
 SSHD = shutil.which("sshd") or "/usr/sbin/sshd"
 MEGABYTE = 1 << 20

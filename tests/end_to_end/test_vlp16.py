@@ -8,7 +8,8 @@ import laspy
 import numpy as np
 
 from flightlog import records
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 from groundproc.cloud import gpstime
 from groundproc.geodesy import Projection, projected_crs

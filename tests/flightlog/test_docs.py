@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from mcap_ros2._vendor.rosidl_adapter.parser import parse_message_string
 
 from flightlog import records
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -9,7 +9,8 @@ import zstandard
 
 from flightlog import container
 from flightlog.container import MAGIC, RECORD_HEAD, Opcode
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.salvage import examine
 from flightlog.walk import Walk
 

@@ -22,7 +22,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from flightlog import records
 from flightlog.errors import LogError
-from flightlog.logfile import LogReader, LogWriter, Message
+from flightlog.logfile import LogReader, Message
+from flightlog.logwriter import LogWriter
 from flightlog.records import FORMAT_VERSION, HostClock, LidarAccount
 
 S = 10**9

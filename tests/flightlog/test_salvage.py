@@ -10,7 +10,8 @@ from mcap.stream_reader import StreamReader
 
 from flightlog import records
 from flightlog.errors import LogError
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.salvage import SALVAGE, examine, salvage
 
 CHUNKS = 12

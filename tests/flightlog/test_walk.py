@@ -9,7 +9,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from flightlog import records, walk
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.walk import ChunkAt, Hole, Walk
 
 CHUNKS = 5

@@ -10,7 +10,8 @@ import yaml
 
 from flightlog import config
 from flightlog.errors import ConfigError
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.mount import LidarMount, Mount
 from groundproc.flight.mounting import find_mount
 from groundproc.survey import Survey

@@ -13,7 +13,7 @@ from lidar_stream import packet
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import hdl32e, records
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 from flightlog.nmea import checksum
 from flightlog.records import HostClock, LidarAccount
 

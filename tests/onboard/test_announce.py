@@ -6,8 +6,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from onboard.announce import Announcer, numbers, states
-from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status
 from onboard.lidarstate import State
+from onboard.status import LidarStatus, LinkStatus, RecorderStatus, Status
 from onboard.voice import Voice
 
 GOOD = Status(

@@ -17,8 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import records
 from flightlog.mavlink import FrameParser
-from onboard.autopilot import LinkCounts, Requester, note_frames
 from onboard.config import StreamsConfig
+from onboard.linkcounts import LinkCounts, note_frames
+from onboard.requester import Requester
 from onboard.timesync import read_clocks
 
 S = 1_000_000_000

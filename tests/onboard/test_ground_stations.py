@@ -12,11 +12,12 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from flightlog.mavlink import FrameParser
 from onboard import announce
 from onboard.announce import Announcer, numbers, states
-from onboard.autopilot import LinkCounts, Requester, note_frames
 from onboard.autopilotclock import AutopilotClock
 from onboard.config import StreamsConfig
-from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status
 from onboard.lidarstate import State
+from onboard.linkcounts import LinkCounts, note_frames
+from onboard.requester import Requester
+from onboard.status import LidarStatus, LinkStatus, RecorderStatus, Status
 from onboard.voice import COMPONENT, Voice
 
 S = 10**9

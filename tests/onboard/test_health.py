@@ -3,9 +3,10 @@ from dataclasses import replace
 import pytest
 
 from flightlog.errors import SwathError
-from onboard import health
-from onboard.health import ClockStatus, Level, LidarStatus, LinkStatus, RecorderStatus, Status
+from onboard import health, healthreport
+from onboard.health import Level
 from onboard.lidarstate import State
+from onboard.status import ClockStatus, LidarStatus, LinkStatus, RecorderStatus, Status, from_json, to_json
 
 S = 1_000_000_000
 GOOD = Status(
@@ -92,13 +93,13 @@ def test_trouble_with_the_disk_is_told(recorder: RecorderStatus, level: int, fin
 
 
 def test_a_status_survives_its_file() -> None:
-    assert health.from_json(health.to_json(GOOD), "here") == GOOD
+    assert from_json(to_json(GOOD), "here") == GOOD
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", "null", '{"lidar": 3}', health.to_json(GOOD).replace("pid", "pit")])
+@pytest.mark.parametrize("text", ["", "[]", "{}", "null", '{"lidar": 3}', to_json(GOOD).replace("pid", "pit")])
 def test_another_file_is_no_status(text: str) -> None:
     with pytest.raises(SwathError, match=r"^s\.json: is no status file of this version of swathd$"):
-        health.from_json(text, "s.json")
+        from_json(text, "s.json")
 
 
 def test_a_worker_is_stalled_when_it_has_made_no_progress_for_too_long() -> None:
@@ -108,7 +109,7 @@ def test_a_worker_is_stalled_when_it_has_made_no_progress_for_too_long() -> None
 
 
 def test_the_report_has_the_verdict_first() -> None:
-    lines = health.report(GOOD, health.judge(GOOD, 101 * S, "b"))
+    lines = healthreport.report(GOOD, health.judge(GOOD, 101 * S, "b"))
     assert lines[0].startswith("GOOD: 00001-000.mcap: lidar 1808/s")
     assert [line.split()[0] for line in lines[1:]] == [
         "lidar", "10500", "position", "ins", "clock", "host", "recorder",

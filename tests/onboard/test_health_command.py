@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from onboard import health
-from onboard.health import LidarStatus, RecorderStatus, Status
 from onboard.lidarstate import State
+from onboard.status import LidarStatus, RecorderStatus, Status, to_json
 
 COMMAND = [sys.executable, "-m", "onboard.cli", "health", "--config"]
 
@@ -26,7 +25,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def write(config: Path, status: Status) -> None:
-    config.with_name("status.json").write_text(health.to_json(status))
+    config.with_name("status.json").write_text(to_json(status))
 
 
 def now(**more: object) -> Status:

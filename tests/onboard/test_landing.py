@@ -2,7 +2,7 @@
 
 import itertools
 
-from onboard.daemon import Landing
+from onboard.landing import Landing
 
 S = 1_000_000_000
 

@@ -17,8 +17,8 @@ from flightlog import config
 from flightlog.errors import ConfigError, SourceError
 from onboard import lidar_settings
 from onboard.cli import main
-from onboard.health import LidarStatus, LinkStatus, RecorderStatus, Status, to_json
 from onboard.lidar_settings import FovSetting, LidarSettings, LidarWeb, compare
+from onboard.status import LidarStatus, LinkStatus, RecorderStatus, Status, to_json
 
 
 def _standin() -> ModuleType:

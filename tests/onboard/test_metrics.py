@@ -13,18 +13,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from recording import recording
 
 from onboard import health, metrics
-from onboard.health import (
-    ClockStatus,
-    DownlinkStatus,
-    Level,
-    LidarStatus,
-    LinkStatus,
-    RecorderStatus,
-    Status,
-    Verdict,
-)
+from onboard.health import Level, Verdict
 from onboard.healthschema import schema
 from onboard.lidarstate import State
+from onboard.status import ClockStatus, DownlinkStatus, LidarStatus, LinkStatus, RecorderStatus, Status, to_json
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -93,7 +85,7 @@ BARE = full(links={}, clocks={}, downlink=None, temperature_c=None)
 
 @pytest.mark.parametrize("status", [full(), BARE, full(lidar=LidarStatus(state=State.NO_LINK))])
 def test_the_json_is_what_the_schema_says(status: Status) -> None:
-    tree = health.told(Verdict(Level.GOOD, []), None, json.loads(health.to_json(status)))
+    tree = health.told(Verdict(Level.GOOD, []), None, json.loads(to_json(status)))
     jsonschema.Draft202012Validator.check_schema(schema())
     jsonschema.validate(tree, schema())
     for name in ("schema", "verdict", "status"):
@@ -108,7 +100,7 @@ def test_the_committed_schema_is_that_of_the_program() -> None:
 def test_several_operators_see_the_same_at_once(tmp_path: Path) -> None:
     config = tmp_path / "swathd.yaml"
     config.write_text(f"status_file: {tmp_path}/status.json\n")
-    (tmp_path / "status.json").write_text(health.to_json(full()))
+    (tmp_path / "status.json").write_text(to_json(full()))
     words = [sys.executable, "-m", "onboard.cli", "health", "--config", config, "--json"]
     running = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     trees = [json.loads(process.communicate(timeout=300)[0]) for process in running]

@@ -22,11 +22,11 @@ from pymavlink import mavparm
 from flightlog.errors import ConfigError, SourceError, SwathError, UsageError
 from flightlog.mavlink import FrameParser, decode
 from onboard import parameter_link
-from onboard.autopilot import _STREAMS
 from onboard.cli import main
 from onboard.config import LinkConfig, StreamsConfig
 from onboard.parameter_link import ParameterLink
 from onboard.parameters import FILES, Difference, Parameter, as_single, compare, generation, parse, shipped
+from onboard.requester import _STREAMS
 
 
 def _standin() -> ModuleType:

@@ -11,11 +11,12 @@ from lidar_stream import Stream, from_address
 
 from onboard import cli
 from onboard.config import FovConfig, LidarConfig, RecorderConfig
-from onboard.health import Level, LidarStatus
+from onboard.health import Level
 from onboard.lidar_settings import LidarSettings
 from onboard.lidarstate import State
 from onboard.parameters import shipped
 from onboard.preflight import check_buffer, check_disk, judge_lidar, missing_deg
+from onboard.status import LidarStatus
 
 _standin = importlib.util.spec_from_file_location("standin_autopilot", Path(__file__).with_name("standin_autopilot.py"))
 assert _standin is not None

@@ -12,9 +12,10 @@ from flightlog.errors import LogError
 from flightlog.logfile import LogReader
 from flightlog.records import HostClock
 from onboard import logfolder
+from onboard.backlog import Backlog
 from onboard.config import RecorderConfig
 from onboard.logfolder import next_segment_path, write_atomically
-from onboard.recorder import Backlog, Recorder
+from onboard.recorder import Recorder
 from onboard.segment import Segment
 
 FIRST = (records.HOST_CLOCK.topic, 5, records.encode_host_clock(HostClock(5, 6, 7, 8)))

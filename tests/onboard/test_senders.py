@@ -11,7 +11,8 @@ import pytest
 from lidar_stream import cable, from_address, inside, needs_namespaces, packet, run
 
 from flightlog import records
-from onboard import lidar, lidarstate
+from onboard import lidarsender, lidarstate
+from onboard.batch import Batch
 from onboard.config import FovConfig, LidarConfig
 from onboard.lidar import LidarPort
 from onboard.readings import LidarReadings, Rates
@@ -122,21 +123,23 @@ def test_a_lidar_named_in_the_configuration_is_the_only_one_from_the_first_packe
 def test_a_stranger_may_not_take_over_from_a_silent_lidar_before_it_is_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(lidar, "_OPEN_NS", 200_000_000)
-    monkeypatch.setattr(lidar, "_FORGET_NS", 3600_000_000_000)
+    monkeypatch.setattr(lidarsender, "_OPEN_NS", 200_000_000)
+    monkeypatch.setattr(lidarsender, "_FORGET_NS", 3600_000_000_000)
     port = Port()
     to = ("127.0.0.1", port.ports[0])
     with from_address(SENSOR) as sensor, from_address(STRANGER) as other:
         sensor.sendto(packet(0), to)
         until(lambda: port.port.counts.sensor == SENSOR)
-        until(lambda: not port.port._is_filtered)  # the kernel lets all in again, to tell why the lidar is silent
+        until(
+            lambda: not port.port._sender._is_filtered
+        )  # the kernel lets all in again, to tell why the lidar is silent
         other.sendto(packet(1, mark=66), to)
         until(lambda: port.port.counts.rejected[lidarstate.WRONG_SENDER] == 1)
         other.sendto(packet(1)[:-1], to)
         until(lambda: port.port.counts.rejected[lidarstate.WRONG_LENGTH] == 1)
         assert port.marks() == {1: 1}
-        monkeypatch.setattr(lidar, "_FORGET_NS", 1_000_000)  # it was set to another address
-        until(lambda: port.port._sensor is None)
+        monkeypatch.setattr(lidarsender, "_FORGET_NS", 1_000_000)  # it was set to another address
+        until(lambda: port.port._sender.address is None)
         other.sendto(packet(2, mark=7), to)
         until(lambda: port.port.counts.sensor == STRANGER)
     port.stop()
@@ -171,7 +174,7 @@ def test_a_full_buffer_is_a_loss_and_not_a_refusal() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, from_address(SENSOR) as sensor:
         sock.bind(("127.0.0.1", 0))
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
-        slow = lidar.Batch(sock, records.SCAN_PACKET_DTYPE, 8, 1206, 512, LogTime(0), 0.02)
+        slow = Batch(sock, records.SCAN_PACKET_DTYPE, 8, 1206, 512, LogTime(0), 0.02)
         slow.receiver.filter(1206, int.from_bytes(socket.inet_aton(SENSOR)))
         for number in range(500):
             sensor.sendto(packet(number), sock.getsockname())
@@ -255,7 +258,7 @@ def test_the_lidars_own_address_by_another_interface_is_refused_and_the_interfac
             run("ip", "-n", aboard, "link", "set", "late0", "down")
             run("ip", "-n", aboard, "link", "set", "late0", "name", "lidar0")
             run("ip", "-n", aboard, "link", "set", "lidar0", "up")
-            until(lambda: bool(port.port._interface))
+            until(lambda: bool(port.port._sender._interface))
             forge(10)
             head(10, 50)
             until(lambda: port.port.counts.sensor == lidar_address)

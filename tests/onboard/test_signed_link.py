@@ -10,9 +10,10 @@ from recording import free_port
 
 from flightlog.mavlink import FrameParser
 from onboard import health
-from onboard.autopilot import LinkCounts, Requester, note_frames, streams_asked
 from onboard.config import StreamsConfig
-from onboard.health import LinkStatus
+from onboard.linkcounts import LinkCounts, note_frames
+from onboard.requester import Requester, streams_asked
+from onboard.status import LinkStatus
 from onboard.voice import Voice
 
 S = 10**9
@@ -140,7 +141,8 @@ def test_a_voice_without_a_key_signs_nothing_and_version_1_never() -> None:
 
 def test_what_was_not_signed_does_not_reach_the_ground_either(tmp_path: Path) -> None:
     from flightlog import records
-    from flightlog.logfile import LogReader, LogWriter
+    from flightlog.logfile import LogReader
+    from flightlog.logwriter import LogWriter
     from groundproc.flight.load import mavlink_frames
 
     data = heartbeat(DISARMED, None, 0) + heartbeat(ARMED, KEY, NOW)

@@ -13,7 +13,8 @@ import numpy.typing as npt
 import pytest
 
 from simulator.config import Options
-from simulator.render import Job, render
+from simulator.render import render
+from simulator.simulation import Job
 
 # 63-9113 Rev A, page 10, retyped: elevation of each laser in firing order
 ELEVATIONS_DEG = np.array([v for k in range(16) for v in (-30.67 + k * 4 / 3, -9.33 + k * 4 / 3)])

@@ -13,7 +13,7 @@ from flightlog import dataflash
 from simulator import boardlog
 from simulator.clocks import clocks
 from simulator.config import Options
-from simulator.render import Job, Simulation
+from simulator.simulation import Job, Simulation
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from simulator.flight import Flight
 from simulator.geodesy import Origin
 from simulator.imu import Triad, Wander
 from simulator.ins import Ins
-from simulator.render import Job, Simulation
 from simulator.scene import scene
+from simulator.simulation import Job, Simulation
 
 CALM = FlightOptions(vibration_deg=0.0)
 

@@ -8,8 +8,8 @@ import pytest
 from flightlog.errors import UsageError
 from simulator.config import MovingOptions, Options
 from simulator.moving import Tracks, Traffic, flat, over_ground
-from simulator.render import Job, Simulation
 from simulator.scene import SCENES, scene
+from simulator.simulation import Job, Simulation
 
 LOOP = over_ground([(-50.0, 10.0), (50.0, 10.0), (50.0, 40.0), (-50.0, 40.0)], flat)
 WALL = np.array([[0.0, 1.0, 0.0, 30.0]])

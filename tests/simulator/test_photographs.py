@@ -20,7 +20,8 @@ from simulator.cameras import CameraOptions, built
 from simulator.config import Options
 from simulator.grid import ZONE_EPSG, on_grid
 from simulator.optics import EQUIDISTANT, Lens, rays
-from simulator.render import Job, Simulation, render
+from simulator.render import render
+from simulator.simulation import Job, Simulation
 from simulator.textures import BANDS, LOOKS, TABLE
 
 SMALL = CameraOptions(width_px=240, height_px=180, focal_px=190.0, interval_s=1.0, first_s=1.5, line_delay_s=2e-4)

@@ -12,7 +12,8 @@ from flightlog.errors import SwathError
 from flightlog.logfile import LogReader
 from flightlog.mount import load_mount, parse_mount
 from simulator.config import MountOptions, Options, perfect
-from simulator.render import Job, render
+from simulator.render import render
+from simulator.simulation import Job
 
 
 def digests(recorded):

@@ -20,12 +20,13 @@ from flightlog.errors import CaptureError
 from flightlog.words import clean
 from groundproc import packed, system
 from groundproc.flight.importers import bagunpacking
+from groundproc.flight.importers.captures import PROBE_PACKETS
 from groundproc.flight.importers.inputs import hash_of
 from groundproc.flight.importers.joining import Event
 from groundproc.flight.importers.kinds import BAG, HEAD_BYTES, MCAP, Kind, kind_of
 from groundproc.flight.importers.mavlinkstreams import frame_bytes
 from groundproc.flight.importers.mended import mended
-from groundproc.flight.importers.sources import PROBE_PACKETS, facts_of
+from groundproc.flight.importers.sources import facts_of
 from groundproc.flight.importers.starting import Start, start_of
 from groundproc.flight.importers.steady import Steady
 from groundproc.flight.importers.topics import topic_sender

@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 
 from flightlog import __version__
 from flightlog.errors import LogError, UsageError
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 from groundproc.files import made_folder
 from groundproc.flight.importers import outcome
+from groundproc.flight.importers.autopilotlogs import DataflashLog, Tlog, open_mavlink
 from groundproc.flight.importers.batching import Joiner
+from groundproc.flight.importers.captures import Capture
 from groundproc.flight.importers.joining import Event, LogMessage
 from groundproc.flight.importers.ports import Ports
 from groundproc.flight.importers.senders import Probed, Senders, address_of
-from groundproc.flight.importers.sources import Capture, DataflashLog, Source, Timed, Tlog, open_mavlink
+from groundproc.flight.importers.sources import Source, Timed
 from groundproc.flight.importers.starting import moves
 from groundproc.flight.lidar import STATED
 

@@ -20,7 +20,7 @@ from flightlog import __version__, frames, records
 from flightlog.clock import utc_text
 from flightlog.constants import NS_PER_MS, NS_PER_S, NS_PER_US
 from flightlog.errors import CaptureError, LogError, UsageError
-from flightlog.logfile import LogWriter
+from flightlog.logwriter import LogWriter
 from groundproc.files import written_aside
 from groundproc.flight.importers.joining import LogMessage
 from groundproc.flight.importers.lines import read_imu, read_lines

@@ -7,10 +7,12 @@ from typing import Any, Final
 
 from flightlog.clock import utc_text
 from flightlog.errors import CaptureError
+from groundproc.flight.importers.autopilotlogs import Tlog
 from groundproc.flight.importers.batching import Joiner
+from groundproc.flight.importers.captures import Capture, snap_text
 from groundproc.flight.importers.ports import Elsewhere, Ports
 from groundproc.flight.importers.senders import listed, name_of
-from groundproc.flight.importers.sources import Capture, Source, Tlog, snap_text
+from groundproc.flight.importers.sources import Source
 
 _NETWORKS: Final = ("capture", "bag")
 """Kinds of sources in which a lidar can be."""

@@ -15,7 +15,8 @@ from groundproc import sensors
 from groundproc.flight import claims
 from groundproc.flight.flight import read_flight
 from groundproc.flight.lidar import lidar_of
-from groundproc.flight.load import BatchJoiner, DeviceClock, PositionBatch, Progress
+from groundproc.flight.load import BatchJoiner, DeviceClock, Progress
+from groundproc.flight.positionpackets import PositionBatch
 from groundproc.flight.summary.lidar import LidarSummary
 from groundproc.flight.summary.position import PositionSummary
 from groundproc.flight.summary.rates import rate_hz, rounded

@@ -8,7 +8,7 @@ import numpy as np
 from flightlog import clock, nmea
 from flightlog.constants import NS_PER_S
 from flightlog.hdl32e import PpsState
-from groundproc.flight.load import PositionBatch, Sentence, new_sentences
+from groundproc.flight.positionpackets import PositionBatch, Sentence, new_sentences
 from groundproc.flight.summary.rates import rate_hz, rounded
 
 _HOUR_NS: Final = 3600 * NS_PER_S

@@ -11,11 +11,12 @@ from flightlog.errors import CaptureError, WrongSensorError
 from flightlog.logfile import Message
 from groundproc import packed, sensors
 from groundproc.flight.importers import outcome
+from groundproc.flight.importers.autopilotlogs import DataflashLog, open_mavlink
 from groundproc.flight.importers.batching import Joiner
+from groundproc.flight.importers.captures import Capture
 from groundproc.flight.importers.kinds import BAG, CAPTURE, DATAFLASH, MCAP, TLOG, Kind, head_of, kind_of
 from groundproc.flight.importers.ports import Ports
 from groundproc.flight.importers.senders import Probed, Senders
-from groundproc.flight.importers.sources import Capture, DataflashLog, open_mavlink
 from groundproc.flight.load import Progress
 from groundproc.flight.summary.log import LogSummary
 from groundproc.sensors.model import Lidar

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from groundproc.analysis.corridor.catenary import fitted
 from groundproc.analysis.corridor.clearance import Clearance
 from groundproc.cli import main
-from simulator import outdoors
+from simulator import outdoors, powerline
 
 ORIGIN = np.array([533_000.0, 6_472_000.0, 0.0])
 
@@ -29,12 +29,12 @@ def write_cloud(path: Path, xyz: np.ndarray, version: str = "1.4", point_format:
 
 
 @pytest.fixture(scope="module")
-def line() -> outdoors.Line:
-    return outdoors.power_line(seed=3, spans=2, per_m2=10.0)
+def line() -> powerline.Line:
+    return powerline.power_line(seed=3, spans=2, per_m2=10.0)
 
 
 @pytest.fixture(scope="module")
-def made(line: outdoors.Line, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(line: powerline.Line, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wires")
     write_cloud(folder / "c.laz", line.xyz)
     words = ["-o", str(folder / "w.geojson"), "--clearance", str(folder / "o.laz"), "--json", str(folder / "f.json")]
@@ -52,7 +52,9 @@ def features(folder: Path, *kinds: str) -> list[tuple[np.ndarray, dict[str, Any]
     ]
 
 
-def test_each_conductor_of_each_span_is_one_line_from_attachment_to_attachment(line: outdoors.Line, made: Path) -> None:
+def test_each_conductor_of_each_span_is_one_line_from_attachment_to_attachment(
+    line: powerline.Line, made: Path
+) -> None:
     found = features(made, "conductor", "guard")
     assert len(found) == len(line.wires)
     for wire in line.wires:
@@ -67,7 +69,7 @@ def test_each_conductor_of_each_span_is_one_line_from_attachment_to_attachment(l
         assert about["sag_m"] == pytest.approx((chord - places[:, 2]).max(), abs=0.01)
 
 
-def test_clearance_is_the_distance_to_the_nearest_true_wire(line: outdoors.Line, made: Path) -> None:
+def test_clearance_is_the_distance_to_the_nearest_true_wire(line: powerline.Line, made: Path) -> None:
     wires = np.concatenate([each.places(np.linspace(0, each.length_m, 4000)) for each in line.wires])
     truth, _ = cKDTree(wires).query(line.xyz)
     las = laspy.read(made / "o.laz")
@@ -81,7 +83,7 @@ def test_clearance_is_the_distance_to_the_nearest_true_wire(line: outdoors.Line,
     assert least == pytest.approx(heights.min(), abs=0.15)
 
 
-def test_poles_stays_and_the_fence_are_found_and_nothing_else(line: outdoors.Line, made: Path) -> None:
+def test_poles_stays_and_the_fence_are_found_and_nothing_else(line: powerline.Line, made: Path) -> None:
     poles = features(made, "pole", "mast")
     assert len(poles) == len(line.poles_m)
     for x, y, foot, height in line.poles_m:
@@ -102,13 +104,13 @@ def test_poles_stays_and_the_fence_are_found_and_nothing_else(line: outdoors.Lin
     )
 
 
-def test_wires_poles_stays_and_fences_have_their_classes(line: outdoors.Line, made: Path) -> None:
+def test_wires_poles_stays_and_fences_have_their_classes(line: powerline.Line, made: Path) -> None:
     kind = np.asarray(laspy.read(made / "o.laz").classification)
-    assert np.mean(np.isin(kind[line.kind == outdoors.WIRE], (13, 14))) > 0.98
-    assert np.mean(kind[line.kind == outdoors.POLE] == 65) > 0.8
-    assert np.mean(np.isin(kind[line.kind == outdoors.STAY], (65, 67))) > 0.9
+    assert np.mean(np.isin(kind[line.kind == powerline.WIRE], (13, 14))) > 0.98
+    assert np.mean(kind[line.kind == powerline.POLE] == 65) > 0.8
+    assert np.mean(np.isin(kind[line.kind == powerline.STAY], (65, 67))) > 0.9
     high = line.xyz[:, 2] - outdoors.rolling(line.xyz[:, :2]) > 0.5
-    assert np.mean(kind[(line.kind == outdoors.FENCE) & high] == 66) > 0.9
+    assert np.mean(kind[(line.kind == powerline.FENCE) & high] == 66) > 0.9
     assert np.mean(np.isin(kind[line.kind == outdoors.TREE], (13, 14, 65, 66, 67))) < 0.01
 
 
@@ -121,14 +123,14 @@ def test_houses_and_trees_have_no_wires(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_an_old_format_keeps_classes_it_cannot_hold(
-    line: outdoors.Line, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    line: powerline.Line, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cloud = write_cloud(tmp_path / "c.las", line.xyz, "1.2", 1)
     words = ["-o", str(tmp_path / "w.gpkg"), "--clearance", str(tmp_path / "o.las")]
     assert main(["wires", str(cloud), *words]) == 0
     assert "classes up to 31 only" in capsys.readouterr().err
     kind = np.asarray(laspy.read(tmp_path / "o.las").classification)
-    assert np.mean(np.isin(kind[line.kind == outdoors.WIRE], (13, 14))) > 0.98
+    assert np.mean(np.isin(kind[line.kind == powerline.WIRE], (13, 14))) > 0.98
 
 
 @pytest.mark.parametrize("a_m", [60.0, 300.0, 4000.0])

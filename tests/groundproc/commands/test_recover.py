@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 
 from flightlog import records
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 
 

@@ -15,7 +15,8 @@ import pytest
 
 from flightlog import records
 from flightlog.errors import LogError, SourceError, UsageError
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 from groundproc.field.replay import Destination, Event, datagrams, parse_mavlink, parse_speed, replay
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from flightlog.constants import HOUR_NS
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 from groundproc.field.madeup import write_flight
 from groundproc.flight.belonging import Part, differences, distance_m, part_of, pause_between_s

@@ -11,7 +11,8 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import hdl32e, records
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.records import LidarAccount
 from groundproc.cli import main
 from groundproc.flight.summary.clockfit import drift

@@ -6,10 +6,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from flightlog import hdl32e, records
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.mavlink import FrameParser
 from flightlog.records import LidarAccount
-from groundproc.flight.load import lidar_batches, mavlink_frames, position_samples
+from groundproc.flight.load import lidar_batches, mavlink_frames
+from groundproc.flight.positionpackets import position_samples
 
 HOUR_NS = 3_600_000_000_000
 START_NS = 1_700_000_000_000_000_000

@@ -11,8 +11,10 @@ from flightlog import hdl32e, records
 from flightlog.constants import HOUR_NS, NS_PER_MS, NS_PER_S
 from flightlog.logfile import LogReader
 from groundproc.cli import main
+from groundproc.flight.importers.autopilotlogs import Tlog
+from groundproc.flight.importers.captures import Capture
 from groundproc.flight.importers.joining import Event
-from groundproc.flight.importers.sources import Capture, Ports, Tlog
+from groundproc.flight.importers.ports import Ports
 from groundproc.flight.importers.starting import Start, moves, start_of
 from groundproc.flight.importers.steady import Steady
 from groundproc.flight.summary.log import summarise

@@ -17,6 +17,7 @@ from flightlog.logfile import LogReader
 from flightlog.mavlink import Frame
 from flightlog.nmea import Rmc
 from groundproc.flight import autopilot, load, timebase
+from groundproc.flight.positionpackets import position_samples
 from groundproc.flight.timebase import HostLine, host_line, lidar_utc
 
 FramesOf = Callable[..., list[Frame]]
@@ -157,7 +158,7 @@ def test_a_counter_that_runs_free_is_no_clock() -> None:
 def test_the_recorded_sensor_knows_its_utc(monterey_log: Path) -> None:
     """GPRMC 220632 to 220633 of 2012-12-11, and the capture's own dates."""
     with LogReader(monterey_log) as reader:
-        samples = load.position_samples([reader])
+        samples = position_samples([reader])
         batch = next(load.lidar_batches([reader]))
     fixes = [(s.device_time_ns, found) for s in samples.sentences if (found := nmea.parse_rmc(s.text))]
     tie = lidar_utc(fixes)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flightlog.errors import ClockError, LogError, SyncError
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from flightlog.mount import Mount
 from groundproc.flight import load
 from groundproc.flight.flight import Flight, read_flight

@@ -19,7 +19,8 @@ from groundproc.imagery.tables import read_control, read_marks
 from groundproc.imagery.times import by_camera, times_of
 from simulator.cameras import CameraOptions
 from simulator.config import Options
-from simulator.render import Job, Simulation, render
+from simulator.render import render
+from simulator.simulation import Job, Simulation
 
 CAMERA = CameraOptions(width_px=64, height_px=48, focal_px=50.0, interval_s=0.7, feedback_lost=0.3, samples=1)
 

@@ -11,7 +11,8 @@ import pytest
 from groundproc.cli import main
 from groundproc.imagery.painting import block as painted
 from simulator import cameras, plans
-from simulator.render import Job, render
+from simulator.render import render
+from simulator.simulation import Job
 
 pytestmark = pytest.mark.soak
 

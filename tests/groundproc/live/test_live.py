@@ -27,10 +27,11 @@ from groundproc.flight.sync import Sync
 from groundproc.live.clocks import Tie
 from groundproc.live.following import Follower
 from groundproc.live.inbox import Inbox, LogClock, Received, scan_packets
+from groundproc.live.lag import Lag
 from groundproc.live.motion import GrowingMotion, MotionBuilder, Samples
+from groundproc.live.pathline import PathLine
 from groundproc.live.receivers import Port, Receivers, open_mavlink
 from groundproc.live.server import PageServer
-from groundproc.live.session import Lag, PathLine
 from groundproc.live.slicer import Slicer
 from groundproc.live.voxelcloud import VoxelCloud
 from groundproc.sensors.shots import Gate

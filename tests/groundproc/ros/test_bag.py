@@ -15,7 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation, Slerp
 
 from flightlog import frames
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.accuracy.truth import read_truth
 from groundproc.cli import main
 from groundproc.cloud.georeference import georeference
