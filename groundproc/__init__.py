@@ -1,5 +1,5 @@
 """The ground side: flight log in, clouds, trajectories and figures about them out."""
 
-from groundproc import kernelcache
+from groundproc.machine import kernelcache
 
 kernelcache.choose()

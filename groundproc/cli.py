@@ -141,7 +141,7 @@ def _dispatch(words: list[str]) -> int:
         module.add_arguments(parser)
         arguments = parser.parse_args(words[1:])
         # imported late, as the command itself: `swath --help` can do without
-        from groundproc.screen import cleaned
+        from groundproc.machine.screen import cleaned
 
         with cleaned():
             return int(module.run(arguments))

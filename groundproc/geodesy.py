@@ -16,7 +16,7 @@ import pyproj
 from pyproj.exceptions import CRSError, ProjError
 
 from flightlog.errors import GeodesyError
-from groundproc import system
+from groundproc.machine import system
 
 Array = npt.NDArray[np.float64]
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pyproj
 
 from flightlog.errors import GeodesyError, UsageError
-from groundproc import datum
-from groundproc.analysis import sitecalibration
+from groundproc.analysis import datum, sitecalibration
 from groundproc.assessment.pairs import read_pairs
 from groundproc.cloud import reader
 from groundproc.cloud.reader import Cloud

@@ -14,8 +14,8 @@ from laspy.vlrs.known import LasZipVlr
 from flightlog.errors import SourceError
 from groundproc.cloud.octree import Cube, Key, Octree
 from groundproc.cloud.spool import Records
-from groundproc.readahead import ahead
-from groundproc.system import cores
+from groundproc.machine.readahead import ahead
+from groundproc.machine.system import cores
 
 _AT_ONCE: Final = min(max(250_000 * cores(), 250_000), 1_000_000)
 """Points that are handed to the compressor together: its threads share whole nodes, of some ten thousand points each."""

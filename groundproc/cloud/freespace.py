@@ -21,8 +21,8 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.cloud.surroundings import LOOK_MS, Surroundings, Voxels, find, middle_of, signed
+from groundproc.machine.system import cores
 from groundproc.numerics.voxelhash import spread, voxel_key
-from groundproc.system import cores
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]

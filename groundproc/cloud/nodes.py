@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError
-from groundproc import system
 from groundproc.cloud import laz, reader
 from groundproc.cloud.lazworker import Task
 from groundproc.cloud.points import Points
 from groundproc.cloud.reader import Cloud
+from groundproc.machine import system
 
 Key = tuple[int, int, int, int]
 """Level, and x, y, z of a node."""

@@ -14,9 +14,9 @@ from groundproc import geodesy
 from groundproc.cloud import georeference
 from groundproc.cloud.points import Dropped, Points
 from groundproc.cloud.selection import Selection
-from groundproc.readahead import ahead
+from groundproc.machine.readahead import ahead
+from groundproc.machine.system import give_back_memory
 from groundproc.sensors.shots import Shots
-from groundproc.system import give_back_memory
 from groundproc.trajectory.trajectory import Trajectory
 
 FARTHEST_M: Final = 1e6

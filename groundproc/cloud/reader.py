@@ -17,12 +17,12 @@ from pyproj.exceptions import CRSError
 
 from flightlog.errors import CaptureError
 from flightlog.words import clean
-from groundproc import system
 from groundproc.cloud import lashead, laz
 from groundproc.cloud.dimensions import TABLE, Dimension, in_order
 from groundproc.cloud.gpstime import Clock, is_week_time
 from groundproc.cloud.points import Points
 from groundproc.cloud.selection import Choice, Selection
+from groundproc.machine import system
 
 CHUNK: Final = 1_000_000
 """Points that are in memory at once, unless they are very large."""

@@ -15,7 +15,7 @@ import pyproj
 from groundproc.cloud.packer import Packer
 from groundproc.cloud.points import Points
 from groundproc.cloud.storing import begun, ended, storing
-from groundproc.system import cores
+from groundproc.machine.system import cores
 
 BUFFER_POINTS: Final = min(max(5 * cores(), 5), 20) * 50_000
 """lazrs compresses 50,000 points at a time on each core: a call of several such for each leaves none idle for long at its end."""

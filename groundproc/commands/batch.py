@@ -74,7 +74,7 @@ def _line(outcome: Outcome) -> str:
 
 def _show(found: Sequence[Outcome]) -> None:
     """A line a flight, and the sum."""
-    from groundproc import screen
+    from groundproc.machine import screen
 
     screen.table(
         ["flight", "verdict", "points", "seconds", "products"],

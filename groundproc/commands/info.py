@@ -26,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read each log once and print its figures and its verdict; one that cannot be read does not keep the others from being told."""
     from flightlog.errors import SwathError
-    from groundproc import screen
     from groundproc.flight.summary.text import as_text
+    from groundproc.machine import screen
 
     told: list[dict[str, Any]] = []
     codes: list[int] = []
@@ -67,7 +67,7 @@ def _summary(path: Path) -> "tuple[dict[str, Any], Verdict | None]":
     from groundproc.commands.inputs import LOG, LOG_WORDS, expect
     from groundproc.flight.summary.log import summarise
     from groundproc.flight.summary.recording import recording_kind, summarise_recording
-    from groundproc.verdict import judge_log
+    from groundproc.verdict.log import judge_log
 
     bag = ("folder",) if (path / "metadata.yaml").is_file() else ()
     expect([path], (*LOG, *_RECORDINGS, *bag), LOG_WORDS)

@@ -92,7 +92,7 @@ def told_damage(logs: Iterable[Path]) -> bool:
     """Say on the terminal which logs are cut off or damaged, and what mends them; whether any is."""
     from flightlog.clock import utc_text
     from flightlog.logfile import LogReader
-    from groundproc.verdict import damage_of
+    from groundproc.verdict.log import damage_of
 
     told = False
     for path in logs:

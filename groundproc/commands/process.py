@@ -94,7 +94,7 @@ def _tell_uses(folder: Path, as_json: bool) -> None:
 
 def _tell(quality: dict[str, Any], folder: Path, as_json: bool) -> int:
     """Print what came of it: figures, every warning, and the verdict as the last line; give its exit code."""
-    from groundproc import screen
+    from groundproc.machine import screen
     from groundproc.verdict import Verdict, warnings_in
 
     verdict = Verdict.from_mapping(quality)

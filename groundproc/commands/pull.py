@@ -35,8 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     import shutil
 
     from flightlog.errors import SourceError
-    from groundproc import system
     from groundproc.field.pull import Vehicle, pull
+    from groundproc.machine import system
 
     missing = [name for name in ("ssh", "rsync") if shutil.which(name) is None]
     if missing or not system.LIMITED:
@@ -69,8 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _list(vehicle: "Vehicle", folder: Path) -> int:
     """What is on the aircraft, and whether it is here already; asks for its manifest, and for nothing else."""
-    from groundproc import screen
     from groundproc.field.pull import segments
+    from groundproc.machine import screen
 
     there = segments(vehicle)
     here = {

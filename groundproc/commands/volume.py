@@ -30,11 +30,11 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from flightlog.errors import UsageError
-    from groundproc import screen
     from groundproc.analysis import volumes
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
+    from groundproc.machine import screen
 
     base = arguments.base
     if base not in volumes.BASES and not base.lower().endswith((".tif", ".tiff")):

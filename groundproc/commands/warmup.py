@@ -22,9 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fly made-up flights through the real stages; what is compiled already is only loaded."""
-    from groundproc import kernelcache
     from groundproc.imagery.painting import warmup as painting
     from groundproc.live.warmup import warm_up
+    from groundproc.machine import kernelcache
     from groundproc.progress import compiling
 
     del arguments

@@ -37,11 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
     import math
 
     from flightlog.errors import UsageError
-    from groundproc import screen
     from groundproc.analysis.wires import Task, work
     from groundproc.commands.figures import claim_json, points_bar, warn, write_json
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
+    from groundproc.machine import screen
     from groundproc.vectors.features import DRIVERS
 
     expect([arguments.cloud], CLOUD, CLOUD_WORDS)

@@ -14,7 +14,7 @@ from groundproc.flight import load
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.load import LidarBatch, Progress
 from groundproc.flight.summary.lidar import LidarSummary
-from groundproc.readahead import ahead
+from groundproc.machine.readahead import ahead
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate, LaserTable, Shots
 

@@ -9,7 +9,7 @@ from urllib.parse import SplitResult, parse_qs
 import numpy as np
 
 from groundproc.live.session import Session
-from groundproc.loopback import Handler, Loopback
+from groundproc.machine.loopback import Handler, Loopback
 
 _MOST: Final = 100_000
 """Points in an answer: 1.3 MB."""

@@ -13,8 +13,8 @@ import pyproj
 
 from flightlog import __version__
 from flightlog.errors import CaptureError, SourceError
+from groundproc.machine.system import without
 from groundproc.raster.grid import Grid, Window
-from groundproc.system import without
 
 with without("boto3"):  # rasterio's own way to S3
     import rasterio

@@ -16,8 +16,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from flightlog.errors import SourceError, UsageError
-from groundproc import system
 from groundproc.files import written_aside
+from groundproc.machine import system
 
 INSIDE: Final = ".swath"
 """Folder within the output folder for what is no product."""

@@ -16,6 +16,7 @@ from flightlog.clock import utc_text
 from flightlog.errors import ClockError, CoverageError, LogError, SourceError, SwathError, UsageError
 from groundproc.estimation.method import Progress
 from groundproc.files import made_folder
+from groundproc.machine.system import give_back_memory
 from groundproc.steps import ORDER
 from groundproc.steps.ledger import (
     INSIDE,
@@ -35,7 +36,6 @@ from groundproc.steps.run import Run
 from groundproc.steps.software import version
 from groundproc.steps.step import BETWEEN, WHOLE, Key, Step, steps
 from groundproc.survey import FILES, Survey
-from groundproc.system import give_back_memory
 
 
 @dataclass(frozen=True, slots=True)

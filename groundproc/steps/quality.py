@@ -17,7 +17,7 @@ from groundproc.steps.step import WHOLE, Folders, Step
 from groundproc.survey import SECTIONS, Survey, section
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
-from groundproc.verdict import judge_flight
+from groundproc.verdict.flight import judge_flight
 
 
 def settings(request: Request) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ import shapely
 from pyproj.exceptions import CRSError
 
 from flightlog.errors import CaptureError, GeodesyError, SourceError, UsageError
-from groundproc.system import without
+from groundproc.machine.system import without
 
 with without("pandas", "geopandas", "pyarrow"):  # data frames: a second, and 60 MB
     import pyogrio

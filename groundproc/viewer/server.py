@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final
 from urllib.parse import SplitResult, parse_qs
 
 from flightlog.errors import SwathError
-from groundproc.loopback import Handler, Loopback
+from groundproc.machine.loopback import Handler, Loopback
 from groundproc.viewer.edits import Edit, edits_of
 from groundproc.viewer.page import VIEWER, held, page, script_of
 from groundproc.viewer.served import Served

@@ -14,7 +14,7 @@ from groundproc.accuracy.alignment import best_rigid
 from groundproc.cli import main
 from groundproc.estimation.odometry.tracker import LOST_M
 from groundproc.trajectory.table import read_trajectory
-from groundproc.verdict import POSITION_M
+from groundproc.verdict.flight import POSITION_M
 
 COMPASS_OFF_DEG = 6.0
 GNSS_SIGMA_M = 1.0

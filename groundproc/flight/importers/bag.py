@@ -18,7 +18,7 @@ from flightlog import hdl32e, records
 from flightlog.constants import NS_PER_S
 from flightlog.errors import CaptureError
 from flightlog.words import clean
-from groundproc import packed, system
+from groundproc import packed
 from groundproc.flight.importers import bagunpacking
 from groundproc.flight.importers.captures import PROBE_PACKETS
 from groundproc.flight.importers.inputs import hash_of
@@ -30,6 +30,7 @@ from groundproc.flight.importers.sources import facts_of
 from groundproc.flight.importers.starting import Start, start_of
 from groundproc.flight.importers.steady import Steady
 from groundproc.flight.importers.topics import topic_sender
+from groundproc.machine import system
 
 _DEFINITIONS: Final = {
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",

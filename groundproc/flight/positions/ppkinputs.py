@@ -11,10 +11,10 @@ import numpy as np
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SourceError, SwathError
-from groundproc import system
 from groundproc.flight.positions import rinex
 from groundproc.flight.positions.ppkoptions import Base, PpkError
 from groundproc.flight.positions.ppkrunning import SOLVER, run, tool
+from groundproc.machine import system
 from groundproc.text import head_of, is_plain, make_plain, open_text
 
 CONVERTER: Final = "convbin"

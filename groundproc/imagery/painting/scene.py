@@ -23,8 +23,8 @@ from groundproc.cloud.spool import Spool
 from groundproc.imagery.painting.planes import Known, columns, surfaces
 from groundproc.imagery.painting.visibility import Surface
 from groundproc.imagery.site import Site
+from groundproc.machine.system import cores
 from groundproc.numerics.voxelhash import sorted_by
-from groundproc.system import cores
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")

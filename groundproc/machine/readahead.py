@@ -9,7 +9,7 @@ import threading
 from collections.abc import Generator, Iterator
 from typing import Final, TypeVar
 
-from groundproc.system import cores
+from groundproc.machine.system import cores
 
 T = TypeVar("T")
 

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 
 from groundproc import verdict
-from groundproc.verdict import BAD, DOUBTFUL, GOOD, Reason, Verdict, judge_flight, judge_log, warnings_in
+from groundproc.verdict import BAD, DOUBTFUL, GOOD, Reason, Verdict, warnings_in
+from groundproc.verdict.flight import judge_flight
+from groundproc.verdict.log import judge_log
 
 Figures = dict[str, Any]
 Change = Callable[[Figures], object]
@@ -195,7 +197,7 @@ def test_the_worst_reason_decides_and_comes_first() -> None:
 @pytest.mark.parametrize(("grade", "code"), [(GOOD, 0), (DOUBTFUL, 3), (BAD, 1)])
 def test_exit_codes_are_those_of_the_conventions(grade: str, code: int) -> None:
     assert Verdict(() if grade == GOOD else (Reason(grade, "a", "b"),)).exit_code == code
-    page = (Path(verdict.__file__).parents[1] / "docs/conventions.md").read_text(encoding="utf-8")
+    page = (Path(verdict.__file__).parents[2] / "docs/conventions.md").read_text(encoding="utf-8")
     assert f"| {code} |" in page
 
 

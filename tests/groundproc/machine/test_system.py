@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from groundproc.system import without
+from groundproc.machine.system import without
 
 
 def test_what_is_hidden_cannot_be_imported_and_can_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from groundproc import readahead, system
-from groundproc.readahead import ahead
+from groundproc.machine import readahead, system
+from groundproc.machine.readahead import ahead
 
 
 @pytest.fixture(autouse=True)

@@ -8,11 +8,11 @@ import sys
 
 import pytest
 
-from groundproc import screen
+from groundproc.machine import screen
 
 HOSTILE = "name\x1b[2J\x1b]0;title\x07"
 CODE = """
-from groundproc import screen
+from groundproc.machine import screen
 with screen.cleaned():
     screen.table(["flight", "verdict", "points"], [["a", "good", "1,000"], [%r, "bad", "2"]])
     screen.summary([("points", "7 points [bold]in[/bold] EPSG:32633"), ("", %r)])

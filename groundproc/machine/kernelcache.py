@@ -25,7 +25,7 @@ KEPT_S: Final = 30 * 86400
 """Kernels that were not used for so long are removed."""
 _PREFIX: Final = "kernels-"
 _PACKAGES: Final = ("groundproc", "flightlog", "simulator")
-_ROOT: Final = Path(__file__).parent.parent
+_ROOT: Final = Path(__file__).parents[2]
 _IMPORT: Final = re.compile(
     rb"^(?:from ((?:%(p)s)[\w.]*) import (?:\(([^)]*)\)|(.*))|import ((?:%(p)s)[\w.]*).*)$"
     % {b"p": b"|".join(name.encode() for name in _PACKAGES)},

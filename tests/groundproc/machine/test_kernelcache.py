@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundproc import kernelcache
+from groundproc.machine import kernelcache
 
 KERNELS = """from numba import njit
 
@@ -66,7 +66,7 @@ def test_a_kernel_stays_when_what_changes_is_not_compiled_in(root: Path) -> None
 
 def test_kernels_of_this_version_know_what_they_hold() -> None:
     """Gravity is compiled into the odometry, and stands in another package."""
-    top = Path(kernelcache.__file__).parent
+    top = Path(kernelcache.__file__).parents[1]
     found = kernelcache.sources(top / "estimation" / "odometry" / "matching.py")
     for name in ("estimation/odometry/state.py", "numerics/rotations.py", "../flightlog/constants.py"):
         assert (top / name).resolve() in found
@@ -82,7 +82,7 @@ def printed(code: str, **environment: str) -> str:
     return done.stdout.strip()
 
 
-FOLDER = "from groundproc import kernelcache; print(kernelcache.folder())"
+FOLDER = "from groundproc.machine import kernelcache; print(kernelcache.folder())"
 
 
 def test_the_cache_is_the_users_and_another_place_may_be_said(tmp_path: Path) -> None:
