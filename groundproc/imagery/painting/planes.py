@@ -26,6 +26,8 @@ _LEAST: Final = 6
 """Points of a plane."""
 _FLAT: Final = 0.3
 """A plane is no rougher than so much of its smaller extent."""
+_FILLS: Final = 0.5 / np.sqrt(12.0)
+"""Smaller extent of a plane, in sides of a cell, at least: of points all over half the width of one. Leaves and branches do not fill it."""
 _UPRIGHT: Final = 0.3
 """Vertical part of the normal below which a plane is a wall."""
 _SMOOTH: Final = 1.5
@@ -111,7 +113,7 @@ def _cells(xyz_m: Array, cell_m: float, offset: float, tops: _Tops) -> tuple[_Ce
     points, middle_m, spread = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 6))
     _moments(xyz_m, of_point, points, middle_m, spread)
     normal, rough_m = np.zeros((count, 3)), np.zeros(count)
-    _planes(points, spread, normal, rough_m)
+    _planes(points, spread, (_FILLS * cell_m) ** 2, normal, rough_m)
     normal = _outwards(normal, middle_m, tops)
     return _Cells(cell_m, keys[:count], table, points, normal, rough_m, middle_m), of_point
 
@@ -234,7 +236,7 @@ def _moments(xyz: Any, of_point: Any, points: Any, middle: Any, spread: Any) -> 
 
 
 @njit(cache=True, nogil=True)
-def _planes(points: Any, spread: Any, normal: Any, rough: Any) -> None:
+def _planes(points: Any, spread: Any, least_square: float, normal: Any, rough: Any) -> None:
     """Normals and roughnesses where there is a plane."""
     found = np.empty(3)
     for c in range(len(points)):
@@ -243,7 +245,7 @@ def _planes(points: Any, spread: Any, normal: Any, rough: Any) -> None:
         s = spread[c]
         least, middle = flattest(s[0], s[1], s[2], s[3], s[4], s[5], found)
         least = max(least, 0.0)
-        if least < _FLAT * _FLAT * middle:
+        if least < _FLAT * _FLAT * middle and middle >= least_square:
             normal[c] = found
             rough[c] = np.sqrt(least * points[c] / (points[c] - 3.0))  # a plane takes three of the points' freedoms
 

@@ -35,6 +35,9 @@ WIDEST_PX: Final = 6
 """Radius of a disc in the depth image [px of it]: of a lone point near the camera."""
 _REACH: Final = 0.85
 """Radius of a disc in spacings: over the half that points keep from an edge, on average."""
+_BEYOND: Final = 0.5
+"""The same of a point that lies in no plane: as far as a thing goes on, on average, beyond the outermost of its points. It need reach no
+neighbour, as gaps between them are closed; and what a leaf does not cover it does not hide."""
 _CLOSED: Final = 1.7
 """Radius of the circles that fit into no gap, in spacings: with a disc's, points at random leave one gap in 300,000."""
 _LOOSE: Final = 0.5
@@ -314,7 +317,7 @@ def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depth
             shape_ = plane[0], plane[1], plane[2], reach
             _disc(shape_, (way, right, below), (u, v, radius), (inverse, plane[3]), near, facing)
         else:
-            _round((u, v, radius), inverse, loose)
+            _round((u, v, radius * (_BEYOND / _REACH)), inverse, loose)
 
 
 @njit(cache=True, nogil=True, inline="always")
