@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from flightlog import frames
 from groundproc.strips.route import Route
@@ -149,6 +148,8 @@ def flown(trajectory: Trajectory) -> Iterator[tuple[Trajectory, int, int]]:
 
 def turns(poses: Trajectory, start_ns: int, bins: int, turn_deg: float) -> Ints:
     """Bins in the middle of turns, of so many from a time on."""
+    from scipy.signal import find_peaks  # half a second of every start
+
     course, change = courses(velocities(poses, start_ns, bins))
     half = _HALF
     cuts, _ = find_peaks(change, height=np.deg2rad(turn_deg), prominence=np.deg2rad(turn_deg) / 4, distance=half)

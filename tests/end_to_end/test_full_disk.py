@@ -21,6 +21,8 @@ from groundproc.field.madeup import write_flight
 SWATH = (sys.executable, "-c", "import sys; from groundproc.cli import main; sys.exit(main())")
 PATIENCE_S = 600.0
 TERMINATED, INTERRUPTED = 143, 130
+SOME = ("--method", "ins", "--products", "cloud.laz,density.tif")
+"""All others are written by the same doors: each into the step's folder, which gets its name at the end."""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cut.mcap").write_bytes(content[: len(content) * 4 // 5])
     (folder / "a.pcap").write_bytes(seeds.pcap(1000))
     (folder / "a.tlog.gz").write_bytes(gzip.compress(seeds.tlog() * 500))
-    assert main(["process", str(folder / "a.mcap"), "-o", str(folder / "out"), "--method", "ins"]) in (0, 3)
+    assert main(["process", str(folder / "a.mcap"), "-o", str(folder / "out"), *SOME]) in (0, 3)
     return folder
 
 
@@ -60,7 +62,7 @@ def disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
 COMMANDS: dict[str, tuple[list[str], int]] = {
     "decode": (["decode", "IN/a.mcap", "--fov", "all", "-o", "DISK/new/a.laz"], 256),
     "recover": (["recover", "IN/cut.mcap", "-o", "DISK/new/whole.mcap"], 256),
-    "process, the cloud": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 1500),
+    "process, the cloud": (["process", "IN/a.mcap", *SOME, "-o", "DISK/new/out"], 1500),
     "process, the first step": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 16),
     "adjust": (["adjust", "IN/out/cloud.laz", "-t", "IN/out/trajectory.csv", "-o", "DISK/new/out"], 256),
     "import": (["import", "--pcap", "IN/a.pcap", "-o", "DISK/new/a.mcap"], 0),
@@ -153,7 +155,7 @@ def test_a_disk_that_fills_up_under_products_leaves_those_that_were_there(
     place = disk(size_kb + 600)
     out = Path(shutil.copytree(inputs / "out", place / "out"))
     before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
-    line = [*SWATH, "process", str(inputs / "a.mcap"), "--method", "ins", "--height", "relative", "-o", str(out)]
+    line = [*SWATH, "process", str(inputs / "a.mcap"), *SOME, "--height", "relative", "-o", str(out)]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert done.returncode == 1, done.stderr
     assert "No space left on device" in done.stderr

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import butter, sosfiltfilt
 
 from groundproc.flight.sync.tracks import low_pass
 from groundproc.numerics import robust
@@ -166,6 +165,8 @@ def lever_matrices(rate_rad_s: Array, turning_rad_s2: Array) -> Array:
 
 def flat_low_pass(values: Array, cutoff_hz: float, rate_hz: float) -> Array:
     """Low-pass along the first axis that leaves slow motion its size: Butterworth of fourth order, forward and back."""
+    from scipy.signal import butter, sosfiltfilt  # half a second of every start
+
     sections = butter(4, min(cutoff_hz, 0.45 * rate_hz), fs=rate_hz, output="sos")
     padding = min(round(3 * rate_hz / cutoff_hz), len(values) - 1)
     return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding))

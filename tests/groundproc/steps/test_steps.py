@@ -1,5 +1,6 @@
 """What a run does again and what it leaves as it is, what it refuses, and what an interrupt leaves behind."""
 
+import itertools
 import json
 import os
 import re
@@ -23,9 +24,11 @@ ORDER = tuple(name for name in ALL if name not in (*OF_IMAGES, "uses"))
 """The steps of a flight without photographs."""
 PATIENCE_S = 300.0
 COMPLETE = (0, 3)
-SOME = ("--method", "ins", "--products", "cloud.laz,pictures,density.tif,trajectory.gpkg")
-"""A cloud, pictures of what is written, a raster of the one pass and a table: a product of each kind."""
 """Exit codes with which the products are there: 3 s of flight are too short to tie the clocks well."""
+SOME = ("--method", "ins", "--products", "cloud.laz,density.tif,trajectory.gpkg")
+"""A cloud, a raster of the one pass and a table."""
+PICTURED = "cloud.laz,pictures,density.tif,trajectory.gpkg"
+"""With pictures of what is written, too: a product of each kind; they take as long as all the others."""
 
 
 @pytest.fixture(scope="module")
@@ -106,9 +109,10 @@ def test_force_does_everything_and_gives_the_same_points(log: Path, out: Path, m
     ("words", "done"),
     [
         (["--crs", "3009"], {"place", "quality", "products"}),
-        (["--min-range", "5"], {"place", "quality", "products"}),
-        (["--height", "relative"], {"trajectory", "place", "quality", "products"}),
-        (["--pose-grid", "10ms"], {"trajectory", "place", "quality", "products"}),
+        # others of the same steps: that each setting is looked at by some step is said below without a run
+        pytest.param(["--min-range", "5"], {"place", "quality", "products"}, marks=pytest.mark.soak),
+        pytest.param(["--height", "relative"], {"trajectory", "place", "quality", "products"}, marks=pytest.mark.soak),
+        pytest.param(["--pose-grid", "10ms"], {"trajectory", "place", "quality", "products"}, marks=pytest.mark.soak),
         (["--height", "ellipsoid", "--geoid", "30"], {"trajectory", "place", "quality", "products"}),
     ],
 )
@@ -171,12 +175,15 @@ def test_a_product_that_is_gone_is_made_again(log: Path, out: Path, made: Path) 
 def test_products_are_made_one_by_one_and_go_when_they_are_not_asked_for(log: Path, out: Path, made: Path) -> None:
     before = (out / "cloud.laz").stat()
     assert steps_of(units(log, out, "--products", "cloud.laz")) == {"quality"}
-    assert not (out / "cloud_height.png").exists()
-    assert steps_of(units(log, out)) == {"place", "quality", "products"}
+    assert not (out / "density.tif").exists()
+    assert steps_of(units(log, out, "--products", PICTURED)) == {"place", "quality", "products"}
+    picture = (out / "cloud_height.png").read_bytes()
+    assert steps_of(units(log, out)) == {"quality", "products"}
     assert names(out) == names(made)
     after = (out / "cloud.laz").stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)  # neither made again nor touched
-    assert (out / "cloud_height.png").read_bytes() == (made / "cloud_height.png").read_bytes()
+    assert steps_of(units(log, out, "--products", PICTURED)) == {"place", "quality", "products"}
+    assert (out / "cloud_height.png").read_bytes() == picture
 
 
 def test_until_stops_and_the_folder_goes_on_by_its_ledger(
@@ -300,8 +307,18 @@ def interrupted(log: Path, folder: Path, step: str, number: int) -> int:
         return run.wait(timeout=PATIENCE_S)
 
 
-@pytest.mark.parametrize("step", ["clocks", "trajectory", "place"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+STEPS = ("clocks", "trajectory", "place")
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("step", "number"),
+    [
+        # every step and every signal once, and all of each with each where there is time
+        pytest.param(step, number, marks=[] if SIGNALS.index(number) == STEPS.index(step) else pytest.mark.soak)
+        for step, number in itertools.product(STEPS, SIGNALS)
+    ],
+)
 def test_a_run_that_is_interrupted_goes_on_after_the_last_finished_step(
     log: Path, made: Path, tmp_path: Path, step: str, number: int
 ) -> None:
