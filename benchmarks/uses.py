@@ -6,8 +6,11 @@ Recordings are found by SWATH_RECORDINGS; where it is unset their figures are nu
 `gdal_viewshed` from the package gdal-bin, null where it is not installed. The last line is one JSON object:
 
 reflectance_error         largest error of the mean of a panel or a cell of 1 m with 100 echoes or more, up to 70 deg of incidence
-strip_bias_percent        largest difference of a strip of lasR's bcts from the others, single echoes in cells of 2 m
-strip_cells_percent       how far single cells of a strip are off, the median, there
+strips_closer             by how many times nearer two strips are to each other than as measured, cells of 1 m, 100 echoes and more
+strips_trend_percent      slope of what is left of their difference, in 10 m across
+strip_bias_percent        largest difference of a strip of lasR's bcts from the others, single echoes in cells of 1 m with 5 and more
+strip_cells_percent       how far single cells of a strip are off, the median, there; `expected`: by the scatter of their own echoes
+strip_surface_...         the same of echoes from surfaces, whose incidence is known
 change_detection_rate     share of boxes of 1 dm3 found, 1000 points/m2 amid swaying shrubs
 change_false_per_100m2    claims that are none, there
 (those of uses_clouds.py)  ground, detection, wires, trees, buildings
@@ -110,7 +113,29 @@ def reflectance() -> Figures:
     true = 1.0 / 80.0 / gains.mean()
     return {
         "reflectance_error": round(float(np.abs(error[count >= 100]).max()), 4),
+        **_between_strips(echoes, value),
         "c_cal_error_in_sigmas": round(abs(told["c_cal"] - true) / told["c_cal_sigma"], 2),
+    }
+
+
+def _between_strips(echoes: dict[str, Any], value: Array) -> Figures:
+    """How two strips differ on the field, before and after."""
+    field = (echoes["surface"] == 0) & np.isfinite(value)
+    cell = np.floor(echoes["xyz"][field, :2]).astype(np.int64)
+    keys, number = np.unique(cell, axis=0, return_inverse=True)
+    number = number.ravel() * 2 + echoes["strip"][field]
+    count = np.bincount(number, minlength=2 * len(keys)).reshape(-1, 2)
+    both = (count >= 100).all(axis=1)
+    raw, made = (
+        np.log(np.divide(*(np.bincount(number, v[field], 2 * len(keys)).reshape(-1, 2) / count)[both].T))
+        for v in (echoes["intensity"], value)
+    )
+    before, after = float(np.median(np.abs(raw))), float(np.median(np.abs(made)))
+    return {
+        "strips_raw_percent": round(100 * before, 2),
+        "strips_after_percent": round(100 * after, 2),
+        "strips_closer": round(before / after, 1),
+        "strips_trend_percent": round(1000 * abs(float(np.polyfit(keys[both, 1], made, 1)[0])), 3),
     }
 
 
@@ -126,10 +151,17 @@ def strips() -> Figures:
     with tempfile.TemporaryDirectory() as out:
         told = run(Task(clouds, Path(out) / "o"), lambda stage, count: None)
     return {
-        "strip_bias_percent": max(abs(each["reflectance_percent"]) for each in told["strips"]),
-        "strip_bias_raw_percent": max(abs(each["raw_percent"]) for each in told["strips"]),
-        "strip_cells_percent": max(each["reflectance_cells_percent"] for each in told["strips"]),
-        "strip_cells_raw_percent": max(each["raw_cells_percent"] for each in told["strips"]),
+        name: max(abs(each[column]) for each in told["strips"])
+        for name, column in (
+            ("strip_bias_percent", "reflectance_percent"),
+            ("strip_bias_raw_percent", "raw_percent"),
+            ("strip_cells_percent", "reflectance_cells_percent"),
+            ("strip_cells_raw_percent", "raw_cells_percent"),
+            ("strip_cells_expected_percent", "reflectance_expected_percent"),
+            ("strip_surface_bias_percent", "surface_percent"),
+            ("strip_surface_cells_percent", "surface_cells_percent"),
+            ("strip_surface_expected_percent", "surface_expected_percent"),
+        )
     }
 
 

@@ -3,6 +3,9 @@
 A voxel lets through the share of beams that entered it and were not thrown back in it. Beams are those of the flight where its
 trajectory is given, else vertical ones from above the cloud. Between two places the shares multiply, each to the power of the way in
 its voxel over its edge. The voxels that hold the two ends are left out: what one stands on does not hide one.
+
+One stands on the lowest point of a column, unless all around it there is lower ground: then that point is a crown, whose ground no beam
+met in this column.
 """
 
 from collections.abc import Callable
@@ -11,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
@@ -31,6 +35,8 @@ Array = npt.NDArray[np.float64]
 
 _EDGE_M: Final = 0.5
 _MOST: Final = 400_000_000
+_CROWN_M: Final = 4.0
+"""What stands higher than its surroundings and is narrower than this is nothing to stand on."""
 
 
 def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
@@ -60,6 +66,7 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
             "larger --cell, or cut out the part of interest with `swath section`"
         )
     hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m), progress)
+    ground = _standing(ground, edge_m)
     through = np.ones(shape, np.float32)
     met = hits + passes
     np.divide(passes, met, out=through, where=met > 0)
@@ -117,6 +124,15 @@ def _met(
     if tally is not None:
         tally.check()
     return hits, passes, ground
+
+
+def _standing(lowest: Array, edge_m: float) -> Array:
+    """Heights to stand on, by the lowest point of each column: an opening, where it lowers a column by more than an edge."""
+    size = 2 * max(round(_CROWN_M / edge_m / 2.0), 1) + 1
+    seen = np.isfinite(lowest)
+    eroded = minimum_filter(lowest, size, mode="constant", cval=np.inf)
+    opened = maximum_filter(np.where(np.isfinite(eroded), eroded, -np.inf), size, mode="constant", cval=-np.inf)
+    return np.where(seen & (lowest - opened > edge_m), opened, lowest)
 
 
 def _places(task: "Task", crs: Any, ground: Array, first: Any, edge_m: float) -> list[tuple[float, float]]:

@@ -103,6 +103,14 @@ def _text(told: dict[str, Any], folder: Path) -> str:
                 f"strip {each['strip']}: {each['raw_percent']:+.1f} % against the others before, "
                 f"{each['reflectance_percent']:+.1f} % after ({each['patches']} patches of 1 m)"
             )
+            if each["surface_percent"] is not None:
+                lines.append(
+                    f"    on surfaces {each['surface_percent']:+.1f} %; single patches are {each['surface_cells_percent']:.1f} % off, "
+                    f"where their echoes' own scatter is {each['surface_expected_percent']:.1f} %"
+                )
+    power, sigma = told["leaves"]["exponent"], told["leaves"]["sigma"]
+    if power:
+        lines.append(f"leaves: by the cosine from the vertical to the power of {power:.2f} (sigma {sigma:.2f})")
     points = told["points"]
     lines.append(
         f"{points['all']:,} points in {folder}, {points['on_surface'] / points['all']:.0%} of them on a surface"

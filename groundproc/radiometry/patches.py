@@ -1,5 +1,7 @@
 """Strengths gathered by small patches of ground: what different lasers and strips say of the same place."""
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,17 +15,21 @@ Array = npt.NDArray[np.float64]
 _CELL_M: Final = 1.0
 _BIN_RAD: Final = np.deg2rad(5.0)
 """Lasers are compared at the same incidence only: no natural surface is quite Lambertian."""
+_FLATTEST: Final = 0.02
+"""Beams that come in flatter than this cosine from the vertical count as this."""
 _MOST: Final = 400_000
 """Rows that are kept; then every other patch is let go."""
-_FEWEST: Final = 5
 _GOLDEN: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
 class _Rows:
     """Sums of values by (patch, group), thinned by patch where they become many."""
 
-    def __init__(self, sums: int) -> None:
+    def __init__(
+        self, sums: int, together: Callable[[npt.NDArray[np.int64]], npt.NDArray[np.int64]] | None = None
+    ) -> None:
         self._parts: list[Array] = []
+        self._together = together
         self._sums, self._rows, self._kept = sums, 0, 0
 
     def add(self, patch: npt.NDArray[np.int64], group: npt.NDArray[Any], *values: Array) -> None:
@@ -44,6 +50,8 @@ class _Rows:
             self._rows = sum(map(len, self._parts))
 
     def _chosen(self, patch: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        if self._together is not None:  # patches that are let go together
+            patch = self._together(patch)
         hashed = patch.astype(np.uint64) * _GOLDEN >> np.uint64(40)
         return np.asarray(hashed & np.uint64((1 << self._kept) - 1) == 0)
 
@@ -56,17 +64,59 @@ class _Rows:
         return np.column_stack([found, *sums])
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What strips say of patches: one row for each patch, strip, kind of echo and band of range.
+
+    Attributes
+    ----------
+    patch, strip, band, count : ndarray of int64, shape (n,)
+    leaf : ndarray of bool, shape (n,)
+        Echoes from no surface, whose incidence is not known.
+    raw, freed, squares : ndarray, shape (n,)
+        Sums of strengths as measured, freed of range and incidence, and of the squares of these.
+    log_rise, log_squares : ndarray, shape (n,)
+        Sums of the logarithm of the cosine of the angle between beam and vertical, and of its squares.
+    """
+
+    patch: npt.NDArray[np.int64]
+    strip: npt.NDArray[np.int64]
+    band: npt.NDArray[np.int64]
+    count: npt.NDArray[np.int64]
+    leaf: npt.NDArray[np.bool_]
+    raw: Array
+    freed: Array
+    squares: Array
+    log_rise: Array
+    log_squares: Array
+
+    def freed_of(self, divided: Array) -> "Seen":
+        """The same, with strengths divided once more, shape (n,)."""
+        return replace(self, freed=self.freed / divided, squares=self.squares / divided**2)
+
+
 class Patches:
     """Gathers strengths by patch and laser, and by patch and strip."""
 
     def __init__(self) -> None:
-        self._lasers, self._strips = _Rows(2), _Rows(2)
+        self._lasers, self._strips = _Rows(2), _Rows(5, parent)
 
     def add(
-        self, xyz_m: Array, strip: npt.NDArray[Any], strength: Array, freed: Array, band: npt.NDArray[np.int64]
+        self,
+        xyz_m: Array,
+        strip: npt.NDArray[Any],
+        leaf: npt.NDArray[np.bool_],
+        band: npt.NDArray[np.int64],
+        values: tuple[Array, Array, Array],
     ) -> None:
-        """Take echoes of strips: strengths as measured, and freed of range and incidence; with the band of their range."""
-        self._strips.add(_cells(xyz_m), strip.astype(np.int64) * BANDS + band, strength, freed)
+        """Take echoes of strips with the band of their range.
+
+        Values are strengths as measured, strengths freed of range and incidence, and cosines of the beams from the vertical.
+        """
+        strength, freed, rise = values
+        group = (strip.astype(np.int64) * 2 + leaf) * BANDS + band
+        log_rise = np.log(np.maximum(rise, _FLATTEST))
+        self._strips.add(_cells(xyz_m), group, strength, freed, freed**2, log_rise, log_rise**2)
 
     def add_lasers(
         self, xyz_m: Array, laser: npt.NDArray[Any], incidence_rad: Array, freed: Array, band: npt.NDArray[np.int64]
@@ -87,39 +137,18 @@ class Patches:
         value = rows[:, 4] / rows[:, 2] if len(rows) else np.zeros(1)
         return float(np.median(value[value > 0])) if (value > 0).any() else 0.0
 
-    def strips(self, by_range: RangeGain) -> list[dict[str, Any]]:
-        """By how much each strip is brighter than the others where they overlap, before and after [percent].
-
-        `..._percent` is the median of all patches, `..._cells_percent` the median of how far single ones are off.
-        """
-        rows = _by_strip(self._strips.rows(), by_range)
-        rows = rows[rows[:, 2] >= _FEWEST]
-        patch = np.unique(rows[:, 0], return_inverse=True)[1] if len(rows) else np.empty(0, np.int64)
-        several = np.bincount(patch) if len(patch) else np.empty(0)
-        told = []
-        for strip in np.unique(rows[:, 1]):
-            own = (rows[:, 1] == strip) & (several[patch] > 1)
-            one: dict[str, Any] = {"strip": int(strip), "patches": int(own.sum())}
-            for name, column in (("raw", 3), ("reflectance", 4)):
-                mean = rows[:, column] / rows[:, 2]
-                others = (np.bincount(patch, mean) - 0.0)[patch] - mean
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    ratio = mean[own] / (others[own] / (several[patch[own]] - 1))
-                ratio = ratio[np.isfinite(ratio)]
-                off = 100.0 * (ratio - 1.0)
-                one[f"{name}_percent"] = round(float(np.median(off)), 3) if len(off) else None
-                one[f"{name}_cells_percent"] = round(float(np.median(np.abs(off))), 3) if len(off) else None
-            told.append(one)
-        return told
+    def seen(self, by_range: RangeGain) -> Seen:
+        """What strips say of patches, freed of the gain by range."""
+        rows = self._strips.rows()
+        patch, group, count = (rows[:, k].astype(np.int64) for k in range(3))
+        kind, band = group // BANDS, group % BANDS
+        found = Seen(patch, kind // 2, band, count, kind % 2 > 0, *rows[:, 3:].T)
+        return found.freed_of(by_range.at(middle_m(band))[0])
 
 
-def _by_strip(rows: Array, by_range: RangeGain) -> Array:
-    """Rows by patch and strip, of those by patch, strip and band: freed of the gain by range."""
-    group = rows[:, 1].astype(np.int64)
-    gain, _ = by_range.at(middle_m(group % BANDS))
-    found, number = np.unique(np.column_stack([rows[:, 0], group // BANDS]), axis=0, return_inverse=True)
-    values = (rows[:, 2], rows[:, 3], rows[:, 4] / gain)
-    return np.column_stack([found, *(np.bincount(number.ravel(), each, len(found)) for each in values)])
+def parent(patch: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Number of the cell of 4 m that a patch lies in, shape (n,)."""
+    return np.asarray((patch >> 24 << 22) | ((patch & 0x3FFFFF) >> 2))
 
 
 def _cells(xyz_m: Array) -> npt.NDArray[np.int64]:

@@ -1,8 +1,9 @@
 """`swath reflectance` as a list of stages: what there is, where the sensor was, surfaces, constants, clouds with reflectance."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -18,9 +19,11 @@ from groundproc.cloud.tiles import Found, Tile, Tiles, side_for
 from groundproc.files import made_folder, written_aside
 from groundproc.numerics import normals
 from groundproc.radiometry import nearrange, report, signal
+from groundproc.radiometry.agreement import agreement
 from groundproc.radiometry.atmosphere import transmission
 from groundproc.radiometry.calibration import FEWEST, Constant, Echoes, combine, constant_of
 from groundproc.radiometry.gains import Gains, speckle
+from groundproc.radiometry.leaves import Leaves, leaves_of
 from groundproc.radiometry.nearrange import RangeGain
 from groundproc.radiometry.sensorpath import Flown, Tally
 from groundproc.radiometry.site import STEEPEST, Progress, Sample, Site, Task, check_names, check_path, look
@@ -39,7 +42,7 @@ _KEPT: Final = {
     "strength": "f4", "range": "f4", "east": "f4", "north": "f4", "up": "f4", "laser": "u1", "strip": "u2", "single": "?",
     "stands": "?",
 }  # fmt: skip
-_FOUND: Final = {"range": "f4", "cosine": "f4", "tilt": "f4"}
+_FOUND: Final = {"range": "f4", "cosine": "f4", "tilt": "f4", "rise": "f4"}
 
 
 def run(task: Task, progress: Progress) -> dict[str, Any]:
@@ -56,8 +59,8 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     site = look(task, progress)
     with made_folder(task.folder):
         found = _surfaces(site, progress)
-        told, gain, by_range, c_cal, spread = _constants(site)
-        _write(site, found, (gain, by_range, spread), c_cal, progress)
+        told, constants = _constants(site)
+        _write(site, found, constants, progress)
         with written_aside(task.folder / REPORT) as aside:
             aside.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return told
@@ -124,7 +127,7 @@ def _surfaces(site: Site, progress: Progress) -> Found:
         cosine = np.abs(np.einsum("ni,ni->n", lies.normal[core], way))
         tilt = lies.sigma_rad[core]
         cosine[(lies.roughness_m[core] > _ROUGHEST_M) | (tilt > _LEAST_KNOWN_RAD)] = np.nan
-        found.put(tile.number[core], {"range": columns["range"], "cosine": cosine, "tilt": tilt})
+        found.put(tile.number[core], {"range": columns["range"], "cosine": cosine, "tilt": tilt, "rise": columns["up"]})
         site.on_surface += int(np.isfinite(cosine).sum())
         _gather(site, tile.xyz_m[core], columns, cosine, tilt)
         progress("surfaces", len(core))
@@ -146,7 +149,13 @@ def _gather(site: Site, xyz_m: Array, columns: dict[str, npt.NDArray[Any]], cosi
     single = usable & columns["single"]  # of a beam that meets several things, each echo has a part
     # only a sensor that takes out the range itself leaves something of it
     band = nearrange.band(range_m) * (site.signal.kind == signal.COMPENSATED)
-    site.patches.add(xyz_m[single], columns["strip"][single], strength[single], freed[single], band[single])
+    site.patches.add(
+        xyz_m[single],
+        columns["strip"][single],
+        ~surface[single],
+        band[single],
+        (strength[single], freed[single], columns["up"][single].astype(np.float64)),
+    )
     alone = surface & columns["single"] & (cosine > np.cos(np.deg2rad(70.0)))
     site.patches.add_lasers(
         xyz_m[alone],
@@ -167,8 +176,32 @@ def _gather(site: Site, xyz_m: Array, columns: dict[str, npt.NDArray[Any]], cosi
             site.echoes[number].append(np.column_stack(part))
 
 
-def _constants(site: Site) -> tuple[dict[str, Any], Gains, RangeGain, tuple[float, float], float]:
-    """The report, gains of lasers and by range, c_cal with its sigma, and the speckle of single echoes."""
+@dataclass(frozen=True, slots=True)
+class Constants:
+    """What strengths are made reflectances by.
+
+    Attributes
+    ----------
+    gain : Gains
+        Of lasers.
+    by_range : RangeGain
+    leaves : Leaves
+    c_cal, c_cal_sigma : float
+        The sigma is nan where there are no targets.
+    speckle : float
+        Relative scatter of single echoes.
+    """
+
+    gain: Gains
+    by_range: RangeGain
+    leaves: Leaves
+    c_cal: float
+    c_cal_sigma: float
+    speckle: float
+
+
+def _constants(site: Site) -> tuple[dict[str, Any], Constants]:
+    """The report, and what the clouds are written with."""
     table, of_band = site.patches.table()
     gain, by_range = nearrange.both(table, of_band)
     constants: list[Constant] = []
@@ -188,10 +221,12 @@ def _constants(site: Site) -> tuple[dict[str, Any], Gains, RangeGain, tuple[floa
         c_cal, sigma = combine(constants)
     else:
         c_cal, sigma = _without_targets(site), float("nan")
-    told = report.told(site, gain, constants, unused, (c_cal, sigma), relative, site.patches.strips(by_range))
+    seen = site.patches.seen(by_range)
+    leaves = leaves_of(seen)
+    told = report.told(site, gain, constants, unused, (c_cal, sigma), relative, agreement(leaves.freed(seen)))
     spread = speckle(table)
-    told["speckle"], told["range_gains"] = round(spread, 4), by_range.tell()
-    return told, gain, by_range, (c_cal, sigma), spread
+    told["speckle"], told["range_gains"], told["leaves"] = round(spread, 4), by_range.tell(), leaves.tell()
+    return told, Constants(gain, by_range, leaves, c_cal, sigma, spread)
 
 
 def _echoes(site: Site, target: Target, rows: Array, gain: Gains, by_range: RangeGain) -> Echoes:
@@ -213,40 +248,41 @@ def _without_targets(site: Site) -> float:
     return report.RELATIVE / max(site.patches.typical(), 1e-300)
 
 
-def _write(
-    site: Site, found: Found, freed_of: tuple[Gains, RangeGain, float], c_cal: tuple[float, float], progress: Progress
-) -> None:
+def _write(site: Site, found: Found, constants: Constants, progress: Progress) -> None:
     """The clouds once more, with the reflectance of every echo."""
     start = 0
-    gain, by_range, spread = freed_of
-    constant = 0.0 if np.isnan(c_cal[1]) else c_cal[1] / c_cal[0]
     with ExitStack() as stack:
         for cloud in site.clouds:
             aside = stack.enter_context(written_aside(site.task.folder / cloud.path.with_suffix(".laz").name))
             with Rewriter(cloud, aside, added=COLUMNS) as new:
                 for chunk in reader.chunks(cloud, columns=("laser",)):
                     count = len(chunk.points)
-                    known = found.take(start, count)
+                    known = {name: v.astype(np.float64) for name, v in found.take(start, count).items()}
                     start += count
-                    raw = site.signal.raw(chunk.record)
                     laser = chunk.points.columns.get("laser", np.zeros(count, np.uint8))
-                    cosine = known["cosine"].astype(np.float64)
-                    flat = np.isfinite(cosine)
-                    range_gain, range_sigma = by_range.at(known["range"].astype(np.float64))
-                    freed = site.signal.linear(raw) * site.factor(
-                        known["range"].astype(np.float64), np.where(flat, cosine, 1.0)
-                    )
-                    value = np.where(site.good(raw), c_cal[0] * freed / gain.gain[laser] / range_gain, np.nan)
-                    tan = np.sqrt(np.maximum(1.0 / np.maximum(np.where(flat, cosine, 1.0), STEEPEST) ** 2 - 1.0, 0.0))
-                    tilt = np.where(flat, tan * np.nan_to_num(known["tilt"]), _LEAVES)
-                    step = 0.2887 / np.maximum(raw, 0.5) if site.signal.field == "intensity" else 0.0
-                    sigma = value * np.sqrt(
-                        constant**2
-                        + spread**2
-                        + tilt**2
-                        + np.square(step)
-                        + gain.sigma[laser] ** 2 * flat
-                        + (range_sigma / range_gain) ** 2
-                    )
+                    value, sigma = _reflectances(site, constants, site.signal.raw(chunk.record), laser, known)
                     new.write(chunk.record, columns={"reflectance": value, "reflectance_sigma": sigma})
                     progress("writing", count)
+
+
+def _reflectances(
+    site: Site, constants: Constants, raw: Array, laser: npt.NDArray[np.uint8], known: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """Reflectance and its sigma, shape (n,) each."""
+    flat = np.isfinite(known["cosine"])
+    facing = np.where(flat, known["cosine"], constants.leaves.facing(known["rise"]))
+    freed = site.signal.linear(raw) * site.factor(known["range"], facing)
+    gain = constants.gain
+    range_gain, range_sigma = constants.by_range.at(known["range"])
+    value = np.where(site.good(raw), constants.c_cal * freed / gain.gain[laser] / range_gain, np.nan)
+    steep = np.maximum(np.where(flat, known["cosine"], 1.0), STEEPEST)
+    tan = np.sqrt(np.maximum(steep**-2 - 1.0, 0.0))
+    parts = (
+        0.0 if np.isnan(constants.c_cal_sigma) else constants.c_cal_sigma / constants.c_cal,
+        constants.speckle,
+        np.where(flat, tan * np.nan_to_num(known["tilt"]), _LEAVES),
+        0.2887 / np.maximum(raw, 0.5) if site.signal.field == "intensity" else 0.0,
+        gain.sigma[laser] * flat,
+        range_sigma / range_gain,
+    )
+    return value, value * np.sqrt(sum(np.square(part) for part in parts))
