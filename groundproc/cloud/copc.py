@@ -9,6 +9,7 @@ from typing import Any, BinaryIO, Final
 import laspy
 import lazrs
 import numpy as np
+import numpy.typing as npt
 from laspy.vlrs.known import LasZipVlr
 
 from flightlog.errors import SourceError
@@ -16,6 +17,8 @@ from groundproc.cloud.octree import Cube, Key, Octree
 from groundproc.cloud.spool import Records
 from groundproc.machine.readahead import ahead
 from groundproc.machine.system import cores
+
+Bytes = npt.NDArray[np.uint8]
 
 _AT_ONCE: Final = min(max(250_000 * cores(), 250_000), 1_000_000)
 """Points that are handed to the compressor together: its threads share whole nodes, of some ten thousand points each."""
@@ -105,12 +108,12 @@ class CopcBuilder:
         compressor.done()
         return keys, counts
 
-    def _batches(self) -> Iterator[list[tuple[Key, bytes]]]:
+    def _batches(self) -> Iterator[list[tuple[Key, Bytes]]]:
         """Nodes and their records, as many at once as keep all threads of the compressor busy."""
-        waiting: list[tuple[Key, bytes]] = []
+        waiting: list[tuple[Key, Bytes]] = []
         points = 0
         for key, records in self._octree.nodes():
-            waiting.append((key, records.tobytes()))
+            waiting.append((key, records.view(np.uint8)))
             points += len(records)
             if points >= _AT_ONCE:
                 yield waiting

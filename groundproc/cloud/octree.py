@@ -31,6 +31,8 @@ _SQUARE_M: Final = 16.0
 """Largest side of a square of the octree."""
 _ROOT_BITS: Final = 24
 """The root spans 2^24 units in each direction."""
+_KEY_BITS: Final = 64
+"""Of a key of Morton's curve."""
 _VOXEL_BITS: Final = 7
 """128 voxels along the side of a node."""
 _LEVELS: Final = _ROOT_BITS - _VOXEL_BITS
@@ -92,11 +94,9 @@ class Octree:
         """Take records, shape (n,); the array may be used again."""
         if not len(records):
             return
-        for axis, name in enumerate("XYZ"):
-            self._low[axis] = min(self._low[axis], int(records[name].min()))
-            self._high[axis] = max(self._high[axis], int(records[name].max()))
-        number, places = _grouped(records["X"] >> _GROUND_BITS, records["Y"] >> _GROUND_BITS)
-        self._spool.add_sorted(records, number, places)
+        ground = np.empty((len(records), 2), np.int64)
+        _ground(records["X"], records["Y"], records["Z"], self._low, self._high, ground)
+        self._spool.add_sorted(records, *_grouped(ground[:, 0], ground[:, 1]))
 
     def cube(self) -> Cube:
         """The root."""
@@ -212,6 +212,15 @@ def _morton(place: Place) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _ground(x: Any, y: Any, z: Any, low: Any, high: Any, out: Any) -> None:
+    """Fill in the squares of the ground, shape (n, 2), and widen the limits, shape (3,)."""
+    for n in range(len(x)):
+        for axis, stored in ((0, x[n]), (1, y[n]), (2, z[n])):
+            low[axis], high[axis] = min(low[axis], stored), max(high[axis], stored)
+        out[n, 0], out[n, 1] = x[n] >> _GROUND_BITS, y[n] >> _GROUND_BITS
+
+
+@njit(cache=True, nogil=True)
 def _within(x: Any, y: Any, z: Any, corner: Any, units: Any, out: Any) -> None:
     """Units from the corner of the root, none beyond its other end."""
     last = float((1 << _ROOT_BITS) - 1)
@@ -228,85 +237,111 @@ def _node(within: Any, n: int, shift: int) -> Any:
     return x | y << _LEVELS | z << 2 * _LEVELS
 
 
-@njit(cache=True, nogil=True)
-def _levels(within: Any, square_bits: int, skipped: Any) -> Any:
-    """Level and node of each point of a square.
+def _levels(within: Numbers, bits: int, skipped: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int8], Numbers]:
+    """Level and node of each point of a square, shape (n,) each.
+
+    Sorted along Morton's curve the points of a voxel stand beside each other at every level: each level is one run over those that are
+    left.
 
     Parameters
     ----------
     within : ndarray of int64, shape (n, 3)
         Units from the corner of the root.
-    square_bits : int
+    bits : int
+        The square spans 2^bits units.
     skipped : ndarray of bool
         Levels at which the square gives nothing.
     """
-    n = len(within)
-    level, node = np.full(n, -1, np.int8), np.zeros(n, np.int64)
-    left, inside = np.arange(n), (1 << square_bits) - 1
-    size = 1
-    while size < 2 * n:
-        size *= 2
-    table, keys = np.full(size, -1, np.int64), np.zeros(size, np.int64)
-    for depth in range(_LEVELS + 1):
-        if len(left) == 0:
-            break
-        shift = _ROOT_BITS - depth  # of a node of this level
-        if skipped[depth]:
-            continue
-        last = depth == _LEVELS
-        if shift <= square_bits:  # nodes lie within the square: small remainders need no further level
-            left = _close(within, left, shift, last, (level, node, table, keys), depth)
-            if len(left) == 0:
-                break
-        voxel = shift - _VOXEL_BITS
-        across = max(square_bits - voxel, 0)  # bits of the voxels along a square
-        table[:] = -1
-        kept = 0
-        for m in range(len(left)):
-            i = left[m]
-            x, y = (within[i, 0] & inside) >> voxel, (within[i, 1] & inside) >> voxel
-            key = x | y << across | (within[i, 2] >> voxel) << 2 * across
-            slot = spread(key) & (size - 1)
-            while table[slot] >= 0 and keys[slot] != key:
-                slot = (slot + 1) & (size - 1)
-            if table[slot] < 0:
-                table[slot], keys[slot] = i, key
-                level[i], node[i] = depth, _node(within, i, shift)
-            else:
-                left[kept] = i
-                kept += 1
-        left = left[:kept]
+    # squares of clouds narrower than 256 m have more bits than a key: their deepest levels would tell points 0.03 mm apart
+    fine = max(-((_KEY_BITS - _ROOT_BITS - 2 * bits) // 3), 0)
+    key = np.empty(len(within), np.uint64)
+    _along_curve(within, bits, fine, key)
+    order = np.argsort(key)
+    level, node = np.empty(len(within), np.int8), np.empty(len(within), np.int64)
+    _descend(within, (key[order], order), (bits, fine), skipped, level, node)
     return level, node
 
 
 @njit(cache=True, nogil=True)
-def _close(within: Any, left: Any, shift: int, last: bool, arrays: Any, depth: int) -> Any:
-    """Give nodes that are small enough all that is left of their points: a handful goes to the parent; what is left then."""
-    level, node, table, keys = arrays
-    size = len(table)
-    table[:] = 0
-    for m in range(len(left)):
-        key = _node(within, left[m], shift)
-        slot = spread(key) & (size - 1)
-        while table[slot] > 0 and keys[slot] != key:
-            slot = (slot + 1) & (size - 1)
-        table[slot] += 1
-        keys[slot] = key
-    kept = 0
-    for m in range(len(left)):
-        i = left[m]
-        key = _node(within, i, shift)
-        slot = spread(key) & (size - 1)
-        while keys[slot] != key or table[slot] == 0:
-            slot = (slot + 1) & (size - 1)
-        if table[slot] <= _FEW and depth > 0:
-            level[i], node[i] = depth - 1, _node(within, i, shift + 1)
-        elif table[slot] <= LEAF or last:
-            level[i], node[i] = depth, key
+def _along_curve(within: Any, bits: int, fine: int, key: Any) -> None:
+    """Keys of Morton's curve in a square, without so many of the lowest bits; what of the height is above the square's side comes first."""
+    inside, above = (1 << bits) - 1, np.uint64(3 * (bits - fine))
+    for n in range(len(within)):
+        x, y, z = (within[n, 0] & inside) >> fine, (within[n, 1] & inside) >> fine, within[n, 2]
+        curve = _apart(x) | _apart(y) << np.uint64(1) | _apart((z & inside) >> fine) << np.uint64(2)
+        key[n] = (np.uint64(z >> bits) << above if bits < _ROOT_BITS else np.uint64(0)) | curve
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _apart(value: Any) -> Any:
+    """The 21 lowest bits, each three places from the next."""
+    out = np.uint64(value)
+    out = (out | out << np.uint64(32)) & np.uint64(0x001F00000000FFFF)
+    out = (out | out << np.uint64(16)) & np.uint64(0x001F0000FF0000FF)
+    out = (out | out << np.uint64(8)) & np.uint64(0x100F00F00F00F00F)
+    out = (out | out << np.uint64(4)) & np.uint64(0x10C30C30C30C30C3)
+    return (out | out << np.uint64(2)) & np.uint64(0x1249249249249249)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cut(shift: int, bits: int, fine: int) -> Any:
+    """By how many bits a key is shifted so that what is left tells cubes of 2^shift units."""
+    return np.uint64(3 * (min(shift, bits) - fine) + max(shift - bits, 0))
+
+
+@njit(cache=True, nogil=True)
+def _descend(within: Any, along: Any, resolution: Any, skipped: Any, level: Any, node: Any) -> None:
+    """Fill in level and node, from the root down; `along`, sorted keys and the points' numbers, is written over."""
+    key, order = along
+    bits, fine = resolution
+    left, deepest = len(key), _LEVELS - fine
+    for depth in range(deepest + 1):
+        shift = _ROOT_BITS - depth  # of a node of this level
+        if skipped[depth]:
+            continue
+        if shift <= bits:  # nodes lie within the square: small remainders need no further level
+            left = _close(within, along, left, (depth, _cut(shift, bits, fine), depth == deepest), level, node)
+        if left == 0:
+            return
+        cut = _cut(shift - _VOXEL_BITS, bits, fine)
+        begin, kept = 0, 0
+        while begin < left:
+            end, first = begin + 1, begin
+            while end < left and key[end] >> cut == key[begin] >> cut:
+                if order[end] < order[first]:
+                    first = end
+                end += 1
+            level[order[first]], node[order[first]] = depth, _node(within, order[first], shift)
+            for m in range(begin, end):
+                if m != first:
+                    key[kept], order[kept] = key[m], order[m]
+                    kept += 1
+            begin = end
+        left = kept
+
+
+@njit(cache=True, nogil=True)
+def _close(within: Any, along: Any, left: int, at: Any, level: Any, node: Any) -> int:
+    """Give nodes that are small enough all that is left of their points: a handful goes to the parent; how many points are left then."""
+    key, order = along
+    depth, cut, last = at
+    shift = _ROOT_BITS - depth
+    begin, kept = 0, 0
+    while begin < left:
+        end = begin + 1
+        while end < left and key[end] >> cut == key[begin] >> cut:
+            end += 1
+        up = 1 if end - begin <= _FEW and depth > 0 else 0
+        if up or end - begin <= LEAF or last:
+            found = _node(within, order[begin], shift + up)
+            for m in range(begin, end):
+                level[order[m]], node[order[m]] = depth - up, found
         else:
-            left[kept] = i
-            kept += 1
-    return left[:kept]
+            for m in range(begin, end):
+                key[kept], order[kept] = key[m], order[m]
+                kept += 1
+        begin = end
+    return kept
 
 
 @njit(cache=True, nogil=True)

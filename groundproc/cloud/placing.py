@@ -14,7 +14,7 @@ from groundproc import geodesy
 from groundproc.cloud import georeference
 from groundproc.cloud.points import Dropped, Points
 from groundproc.cloud.selection import Selection
-from groundproc.machine.readahead import ahead
+from groundproc.machine.readahead import ahead, beside
 from groundproc.machine.system import give_back_memory
 from groundproc.sensors.shots import Shots
 from groundproc.trajectory.trajectory import Trajectory
@@ -70,6 +70,7 @@ def handed_on(
     projection : geodesy.Projection
         From the trajectory's frame.
     sinks : sequence of Sink
+        That which takes longest to finish is the first: the others are finished beside it, by a thread.
     selection : Selection
         Which of the projected points are wanted.
 
@@ -97,8 +98,7 @@ def handed_on(
     if not count:
         raise CoverageError(f"not one shot gives a point: {_why_nothing(dropped, trajectory)}")
     give_back_memory()  # finishing an octree takes much
-    for sink in sinks:
-        sink.finish()
+    beside([sink.finish for sink in sinks])
     return Placed(count, dropped, dict(selection.left_out))
 
 

@@ -70,9 +70,11 @@ class Spool:
         """All records of a square, piece by piece, in the order in which they came; they are here no longer."""
         for begin, size in self._pieces.pop(place, ()):
             self._file.seek(begin)
-            raw = np.frombuffer(self._unpack.decompress(self._file.read(size)), np.uint8)
-            # bytes of the same rank lie together, as they are compressed best
-            yield np.ascontiguousarray(raw.reshape(self._dtype.itemsize, -1).T).view(self._dtype)[:, 0]
+            ranks = np.frombuffer(self._unpack.decompress(self._file.read(size)), np.uint8)
+            ranks = ranks.reshape(self._dtype.itemsize, -1)
+            records = np.empty(ranks.shape[1], self._dtype)
+            _by_record(ranks, _bytes_of(records))
+            yield records
         waiting = self._waiting.pop(place, [])
         self._bytes -= sum(each.nbytes for each in waiting)
         self.counts.pop(place, None)
@@ -84,11 +86,13 @@ class Spool:
         at = self._file.tell()
         many = {place for place, parts in self._waiting.items() if sum(map(len, parts)) >= _SMALL}
         for place in many or list(self._waiting):
-            records = _joined(self._waiting.pop(place))
-            self._bytes -= records.nbytes
-            raw = records.view(np.uint8).reshape(len(records), self._dtype.itemsize)
-            ranks = np.empty(raw.shape[::-1], np.uint8)
-            _by_rank(raw, ranks)
+            parts = self._waiting.pop(place)
+            # bytes of the same rank together are compressed best
+            ranks, done = np.empty((self._dtype.itemsize, sum(map(len, parts))), np.uint8), 0
+            for records in parts:
+                _by_rank(_bytes_of(records), ranks[:, done : done + len(records)])
+                done += len(records)
+            self._bytes -= ranks.nbytes
             packed = self._pack.compress(ranks.data)
             self._file.write(packed)
             self._pieces.setdefault(place, []).append((at, len(packed)))
@@ -103,6 +107,11 @@ def _joined(parts: list[Records]) -> Records:
     return parts[0] if len(parts) == 1 else np.concatenate([each.view(whole) for each in parts]).view(parts[0].dtype)
 
 
+def _bytes_of(records: Records) -> npt.NDArray[np.uint8]:
+    """The same memory as bytes, shape (n, bytes of a record)."""
+    return records.view(np.uint8).reshape(len(records), records.dtype.itemsize)
+
+
 @njit(cache=True, nogil=True)
 def _by_rank(rows: Any, out: Any) -> None:
     """Bytes of the same rank together, (n, m) to (m, n), in blocks that stay in the nearest cache."""
@@ -111,3 +120,13 @@ def _by_rank(rows: Any, out: Any) -> None:
         for rank in range(len(out)):
             for row in range(start, stop):
                 out[rank, row] = rows[row, rank]
+
+
+@njit(cache=True, nogil=True)
+def _by_record(ranks: Any, out: Any) -> None:
+    """Bytes of the same record together again, (m, n) to (n, m)."""
+    for start in range(0, len(out), 256):
+        stop = min(start + 256, len(out))
+        for rank in range(len(ranks)):
+            for row in range(start, stop):
+                out[row, rank] = ranks[rank, row]

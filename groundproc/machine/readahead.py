@@ -1,12 +1,13 @@
-"""Work done ahead by a thread: the next piece of a stream is made while the last one is used.
+"""Work done by a second thread: the next piece of a stream is made while the last one is used, and short works beside a long one.
 
-That gains time where the work is in kernels and libraries that leave the interpreter to others meanwhile: reading, decoding, placing.
+That gains time where the work is in kernels and libraries that leave the interpreter to others meanwhile: reading, decoding, placing,
+compressing.
 """
 
 import contextlib
 import queue
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Final, TypeVar
 
 from groundproc.machine.system import cores
@@ -86,3 +87,36 @@ def ahead(
         over.set()
         room.release()
         thread.join()
+
+
+def beside(works: Sequence[Callable[[], object]]) -> None:
+    """Do some works that do not need each other: the first here, the others in their order by one thread beside it; on one core all here.
+
+    The longest one is to be the first: an interrupt ends it at once, and the others after the one that is being done. An error of the first
+    goes before one of the others.
+    """
+    if cores() == 1 or len(works) < 2:
+        for work in works:
+            work()
+        return
+    errors: list[BaseException] = []
+    over = threading.Event()
+
+    def do_others() -> None:
+        try:
+            for work in works[1:]:
+                if not over.is_set():
+                    work()
+        except BaseException as raised:  # whatever it is, it is told by the other thread
+            errors.append(raised)
+
+    thread = threading.Thread(target=do_others, name="beside", daemon=True)
+    thread.start()
+    try:
+        works[0]()
+        thread.join()
+    finally:
+        over.set()
+        thread.join()
+    if errors:
+        raise errors[0]

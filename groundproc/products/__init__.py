@@ -27,12 +27,15 @@ class Entry:
         A few words for people.
     by_default : bool
         Made where the survey chooses none.
+    long : bool
+        Takes the longest to finish: the others are finished beside it.
     """
 
     module: str
     attribute: str
     about: str
     by_default: bool = True
+    long: bool = False
 
 
 REGISTRY: Final[dict[str, Entry]] = {
@@ -42,7 +45,7 @@ REGISTRY: Final[dict[str, Entry]] = {
         "Pictures",
         "cloud_height.png (as a lit surface), cloud_intensity.png: from above and from the south, to scale",
     ),
-    "cloud.copc.laz": Entry("groundproc.products.cloud_copc", "CloudCopc", "the same points as an octree, for viewers"),
+    "cloud.copc.laz": Entry("groundproc.products.cloud_copc", "CloudCopc", "the same points as an octree, for viewers", long=True),
     "tiles": Entry(
         "groundproc.products.tiles", "Tiles", "tiles/: the points in squares of 250 m, cloud.vpc opens them all", by_default=False
     ),
@@ -66,7 +69,8 @@ REGISTRY: Final[dict[str, Entry]] = {
         "groundproc.products.trajectory_maps", "write", "the flown path for phones and globes: trajectory.gpx and .kml", by_default=False
     ),
     "report.html": Entry(
-        "groundproc.products.report", "write", "the flight on one page for the browser: verdict, cloud, maps, quality, losses, hashes"
+        "groundproc.products.report", "write", "the flight on one page for the browser: verdict, cloud, maps, quality, losses, hashes",
+        long=True,
     ),
     "adjustment.png": Entry(
         "groundproc.products.adjustment_plot", "draw", "method adjusted: what it left over, and how well it knows what it estimated"
@@ -91,11 +95,14 @@ class Chosen:
         A class of points, or a function of a finished flight.
     options : tuple
         Its `Options` where it has some; else empty.
+    long : bool
+        As in `Entry`.
     """
 
     name: str
     maker: Any
     options: tuple[Any, ...]
+    long: bool = False
 
     @property
     def takes_points(self) -> bool:
@@ -138,6 +145,11 @@ def chosen(
     return [_loaded(name, registry[name], options[name], what) for name in registry if name in options]
 
 
+def longest_first(products: Iterable[Chosen]) -> list[Chosen]:
+    """Products in the order in which they are finished: those that take longest, then the others."""
+    return sorted(products, key=lambda each: not each.long)
+
+
 def plain(products: Iterable[Chosen]) -> dict[str, Any]:
     """Chosen products and their options as plain values by name: what decides whether they are to be made again."""
     return {each.name: [config.to_mapping(options) for options in each.options] for each in products}
@@ -156,4 +168,4 @@ def _loaded(name: str, entry: Entry, given: Any, what: str) -> Chosen:
     if own is None and given:
         raise ConfigError(f"{what}: {name}: {given!r} found, but it has no options")
     options = () if own is None else (config.from_mapping(given, own, f"{what}: {name}"),)
-    return Chosen(name, getattr(module, entry.attribute), options)
+    return Chosen(name, getattr(module, entry.attribute), options, entry.long)

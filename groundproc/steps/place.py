@@ -21,7 +21,7 @@ from groundproc.flight.lidar import lidar_of
 from groundproc.flight.shots import Tally, shots
 from groundproc.flight.timeline import tied
 from groundproc.geodesy import LocalFrame
-from groundproc.products import chosen, plain
+from groundproc.products import chosen, longest_first, plain
 from groundproc.products.product import Context, Making, streamed
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate
@@ -117,7 +117,7 @@ def work(run: Run, folders: Folders) -> None:
     scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging, lines)
     with contextlib.ExitStack() as stack:
         sinks: list[Making] = []
-        for each in chosen(survey.products):
+        for each in longest_first(chosen(survey.products)):
             if each.name in folders:
                 own = replace(context, folder=folders[each.name])
                 sinks += stack.enter_context(streamed([each], own))

@@ -1,12 +1,14 @@
 """Step products: those that are made of what the finished steps left."""
 
+import functools
 import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from groundproc.products import chosen, plain
+from groundproc.machine.readahead import beside
+from groundproc.products import chosen, longest_first, plain
 from groundproc.products.product import Context, draw
 from groundproc.steps import OF_IMAGES
 from groundproc.steps.ledger import INSIDE, open_ledger
@@ -34,9 +36,13 @@ def work(run: Run, folders: Folders) -> None:
     projection = projection_of(made.trajectory.frame, run.survey)
     digests = digests_of(run.folder)
     context = Context(run.folder, run.folder, run.survey, made, projection, quality, digests, run.names)
-    for each in chosen(run.survey.products):
-        if each.name in folders:
-            draw([each], replace(context, folder=folders[each.name]))
+    beside(
+        [
+            functools.partial(draw, [each], replace(context, folder=folders[each.name]))
+            for each in longest_first(chosen(run.survey.products))
+            if each.name in folders
+        ]
+    )
 
 
 def digests_of(folder: Path) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """A cloud of any size thinned to so many points, evenly: of an octree only what is needed is read."""
 
+import contextlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from groundproc.cloud import reader
 from groundproc.cloud.nodes import NodeReader, is_copc, octree_of
 from groundproc.cloud.reader import Cloud
+from groundproc.machine.readahead import ahead
 from groundproc.numerics.voxelhash import assign
 
 Array = npt.NDArray[np.float64]
@@ -68,14 +70,15 @@ def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None) -> Thi
     held: dict[str, npt.NDArray[Any]] = {}
     used = 0
     # filled piece by piece: pieces and their sum together would be twice the memory
-    for part in (_of_octree if octree else _of_file)(cloud, room, columns):
-        arrays = {"": part.xyz_m, **part.columns} | ({} if part.time_s is None else {_TIME: part.time_s})
-        count = min(len(part), room + _MORE - used)
-        for name, values in arrays.items():
-            if name not in held:
-                held[name] = np.empty((room + _MORE, *values.shape[1:]), values.dtype)
-            held[name][used : used + count] = values[:count]
-        used += count
+    with contextlib.closing(ahead((_of_octree if octree else _of_file)(cloud, room, columns))) as parts:
+        for part in parts:
+            arrays = {"": part.xyz_m, **part.columns} | ({} if part.time_s is None else {_TIME: part.time_s})
+            count = min(len(part), room + _MORE - used)
+            for name, values in arrays.items():
+                if name not in held:
+                    held[name] = np.empty((room + _MORE, *values.shape[1:]), values.dtype)
+                held[name][used : used + count] = values[:count]
+            used += count
     whole = {name: values[:used] for name, values in held.items()}
     time_s = whole.pop(_TIME, None)
     return thinner(Thinned(whole.pop(""), whole, time_s, 0.0), most)

@@ -1,12 +1,14 @@
-"""Streams made ahead by a thread."""
+"""Streams made ahead by a thread, and works done beside each other."""
 
+import functools
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from groundproc.machine import readahead, system
-from groundproc.machine.readahead import ahead
+from groundproc.machine.readahead import ahead, beside
 
 
 @pytest.fixture(autouse=True)
@@ -104,3 +106,57 @@ def test_threads_are_as_many_as_was_told_and_no_more_than_there_are(monkeypatch:
     for told, given in (("1", 1), ("100000", there), ("0", there), ("many", there)):
         monkeypatch.setenv(system.THREADS, told)
         assert system.cores() == given, told
+
+
+def test_the_first_work_is_done_here_and_the_others_in_their_order_beside_it() -> None:
+    done: list[str] = []
+    others = threading.Event()
+
+    def first() -> None:
+        assert others.wait(30.0), "the others do not wait for the first"
+        done.append(threading.current_thread().name)
+
+    def last() -> None:
+        done.append("last")
+        others.set()
+
+    beside([first, lambda: done.append("second"), last])
+    assert done == ["second", "last", threading.current_thread().name]
+
+
+def test_on_one_core_works_are_done_in_their_order_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readahead, "cores", lambda: 1)
+    done: list[tuple[int, str]] = []
+    beside([lambda number=number: done.append((number, threading.current_thread().name)) for number in range(4)])
+    assert done == [(number, threading.current_thread().name) for number in range(4)]
+
+
+def test_an_error_of_a_work_beside_comes_when_the_first_is_done() -> None:
+    first = threading.Event()
+
+    def fails() -> None:
+        raise ValueError("cannot be drawn")
+
+    with pytest.raises(ValueError, match="cannot be drawn"):
+        beside([first.set, fails])
+    assert first.is_set()
+
+
+def test_an_interrupt_of_the_first_lets_one_work_end_and_begins_no_other() -> None:
+    begun, ended = list[int](), list[int]()
+
+    def first() -> None:
+        while not begun:
+            time.sleep(0.001)
+        raise KeyboardInterrupt
+
+    def other(number: int) -> None:
+        begun.append(number)
+        time.sleep(0.001)
+        ended.append(number)
+
+    many = 100_000
+    with pytest.raises(KeyboardInterrupt):
+        beside([first, *(functools.partial(other, number) for number in range(many))])
+    assert begun == ended, "the one that was being done is whole"
+    assert len(begun) < many

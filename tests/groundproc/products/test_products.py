@@ -17,7 +17,7 @@ from groundproc import products
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
 from groundproc.geodesy import LocalFrame, Projection, projected_crs
-from groundproc.products import Entry, chosen, plain
+from groundproc.products import Entry, chosen, longest_first, plain
 from groundproc.products.product import Context, draw, streamed
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
@@ -172,6 +172,13 @@ def test_without_a_wish_all_defaults_are_made_in_the_order_of_the_registry() -> 
     ]  # fmt: skip
     assert [each.name for each in chosen(["pictures", "cloud.laz"])] == ["cloud.laz", "pictures"]
     assert chosen(["quality.json", "trajectory.csv"]) == []
+
+
+def test_what_takes_longest_is_finished_first_and_the_others_keep_their_order() -> None:
+    every = chosen(None)
+    names = [each.name for each in longest_first(every)]
+    assert names[:2] == ["cloud.copc.laz", "report.html"]
+    assert names[2:] == [each.name for each in every if each.name not in names[:2]]
 
 
 def test_the_cloud_states_where_it_is_and_what_its_points_have(context: Context) -> None:
