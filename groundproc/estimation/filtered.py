@@ -14,6 +14,7 @@ from groundproc.estimation.inertial.readings import read
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.legs import leg_by_leg
 from groundproc.estimation.method import Given, Method, Progress
+from groundproc.estimation.observations.outside import shared
 from groundproc.estimation.observations.states import (
     ATTITUDE,
     COMPASS,
@@ -124,6 +125,7 @@ def pose_covariance(solution: Solution) -> Array:
     heading, pitch, _ = frames.attitude_of(frames.mat_from_quat(solution.quat[row]))
     states = np.r_[POSITION : POSITION + 3, ATTITUDE : ATTITUDE + 3]
     covariance = solution.covariance[:, states[:, None], states].astype(np.float64)
+    covariance += shared(solution.readings.outside, solution.kept_ns)
     # a small turn in the local frame as changes of roll, pitch, heading
     to_angles = np.tile(np.eye(SIZE), (len(row), 1, 1))
     to_angles[:, 3:, 3:] = mat_attitude_turn(heading, pitch)

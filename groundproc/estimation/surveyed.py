@@ -12,13 +12,13 @@ from groundproc import geodesy
 from groundproc.estimation import ownsolution
 from groundproc.estimation.method import Given
 from groundproc.flight.control import ControlPoint, read_control
-from groundproc.flight.positions.fixes import OutsideFixes, lever_arm, outside_fixes
+from groundproc.flight.positions.fixes import OutsideFixes, Tied, lever_arm, outside_fixes
 from groundproc.flight.positions.poses import FORMAT as POSES
 from groundproc.flight.positions.poses import read_poses
 from groundproc.flight.positions.reading import read_solution
 from groundproc.flight.positions.solution import ELLIPSOID, MSL, Quality, Solution
 from groundproc.trajectory.covariance import correlation_of, scaled
-from groundproc.trajectory.estimate import COVARIANCE, read_covariance
+from groundproc.trajectory.estimate import COVARIANCE, read_covariance, read_tied
 
 SMOOTHED_INTERVAL_S: Final = 1.0
 """Spacing at which outside solutions are taken that were smoothed with an IMU: their errors hang together for about as long."""
@@ -66,6 +66,8 @@ def _in_frame(given: Given, path: Path) -> OutsideFixes:
         undulation_m=undulation_m,
         interval_s=SMOOTHED_INTERVAL_S if smoothed else 0.0,
     )
+    if beside is not None:
+        outside = with_ties(outside, beside)
     if not len(outside.between(start_ns, end_ns)):
         raise LogError(
             f"{path}: no position between {utc_text(start_ns)} and {utc_text(end_ns)}, when the autopilot had its own"
@@ -118,6 +120,30 @@ def with_covariance(solution: Solution, path: Path) -> Solution:
         cross_covariance_m_rad=found[:, :3, 3:],
         sigma_source=f"{solution.source} and {path.name}",
     )
+
+
+def with_ties(fixes: OutsideFixes, path: Path) -> OutsideFixes:
+    """Poses with what a covariance.npz says of how they hang together; as they are where it says nothing, or not of all of them.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, or its matrices are no covariances.
+    """
+    found = read_tied(path)
+    if found is None:
+        return fixes
+    time_ns, _ = read_covariance(path)
+    row = np.clip(np.searchsorted(time_ns, fixes.time_ns), 0, len(time_ns) - 1)
+    if not np.array_equal(time_ns[row], fixes.time_ns):
+        return fixes
+    tied = Tied(*found).rows(row)
+    for name, part in (("own", tied.own), ("shared", tied.shared)):
+        size = np.trace(part, axis1=1, axis2=2)
+        least = float((np.linalg.eigvalsh(part)[:, 0] / np.where(size > 0.0, size, 1.0)).min(initial=0.0))
+        if least < _LEAST_EIGENVALUE:
+            raise LogError(f"{path}: {name} with an eigenvalue of {least:.2g} of its size found, expected none below 0")
+    return replace(fixes, tied=tied)
 
 
 def _sigmas(solution: Solution) -> np.ndarray:

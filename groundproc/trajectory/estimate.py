@@ -266,6 +266,34 @@ def read_covariance(path: Path) -> tuple[npt.NDArray[np.int64], Array]:
     return time_ns, covariance.astype(np.float64)
 
 
+TIED: Final = ("step", "own", "shared")
+"""Arrays of the covariance.npz beside poses that were adjusted together (`positions.fixes.Tied`)."""
+
+
+def read_tied(path: Path) -> tuple[Array, Array, Array] | None:
+    """Steps, shape (m, 6), and covariances, own and shared, shape (m, 6, 6), of a covariance.npz; None where it has none.
+
+    Raises
+    ------
+    LogError
+        It cannot be read, or holds something else.
+    """
+    held = read_arrays(path)
+    if not any(name in held for name in TIED):
+        return None
+    rows = len(np.atleast_1d(held["time_ns"]))
+    found = []
+    for name, shape in zip(TIED, ((rows, SIZE), (rows, SIZE, SIZE), (rows, SIZE, SIZE)), strict=True):
+        _check(
+            path,
+            name in held and held[name].shape == shape and held[name].dtype.kind == "f",
+            f"{name} of shape {shape}",
+        )
+        _check(path, bool(np.isfinite(held[name]).all()), f"{name} of numbers")
+        found.append(held[name].astype(np.float64))
+    return found[0], found[1], found[2]
+
+
 def _read_datum(path: Path) -> Array | None:
     """What all poses share, shape (6, 6); None where the file does not say."""
     datum = read_arrays(path).get("datum")

@@ -365,7 +365,8 @@ def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: 
 class OutsideRows(Measured):
     """The same in the smoother, with velocities where they are stated.
 
-    What lasts of the errors of a receiver is a state. Poses are taken as they come.
+    What lasts of the errors of a receiver is a state. Poses are taken as they come; those that were adjusted together as they are after
+    that, each with its own error alone: what they share moves all that lies between them, and is added to what the smoother states.
     """
 
     fixes: OutsideFixes
@@ -386,7 +387,10 @@ class OutsideRows(Measured):
         left = fixes.position_m[inside] - place.position_m - arm
         turn, spread = self._turn(place, inside), fixes.attitude_covariance_rad2
         whole = self._pose_covariance(inside)
-        if turn is not None and whole is not None:
+        if turn is not None and fixes.tied is not None:
+            poses = np.concatenate([left, turn], axis=1) + fixes.tied.step[inside]
+            _add_poses(rows, place, fixes.tied.own[inside], poses, arm)
+        elif turn is not None and whole is not None:
             _add_poses(rows, place, whole, np.concatenate([left, turn], axis=1), arm)
         else:
             rows.add_whitened("outside position", place.node, covariance, left, blocks)
@@ -442,6 +446,25 @@ def lasting(sources: Sequence[OutsideFixes]) -> tuple[Array, float]:
     variance = np.concatenate([np.diagonal(each.covariance_m2, axis1=1, axis2=2) for each in receivers])
     quality = Quality(int(np.median(np.concatenate([each.quality for each in receivers]))))
     return np.sqrt(LASTS * np.median(variance, axis=0)), TAU_S.get(quality, LONGER_S)
+
+
+SHARED_FADES_S: Final = 20.0
+"""How long what tied poses share is left before the first and after the last of them, where receivers take over."""
+
+
+def shared(sources: Sequence[OutsideFixes], time_ns: Ints) -> Array:
+    """Covariance of place and turn that tied poses share, at times, shape (n, 6, 6)."""
+    total = np.zeros((len(time_ns), 6, 6))
+    for fixes in sources:
+        if fixes.tied is None or not len(fixes):
+            continue
+        zero = int(fixes.time_ns[0])
+        now_s, own_s = (time_ns - zero) * 1e-9, (fixes.time_ns - zero) * 1e-9
+        columns = fixes.tied.shared.reshape(-1, 36).T
+        between = np.stack([np.interp(now_s, own_s, column) for column in columns], axis=1)
+        away_s = np.maximum(np.maximum(own_s[0] - now_s, now_s - own_s[-1]), 0.0)
+        total += between.reshape(-1, 6, 6) * np.exp(-away_s / SHARED_FADES_S)[:, None, None]
+    return total
 
 
 def white_part(covariance: Array, lasting_m2: Array) -> Array:

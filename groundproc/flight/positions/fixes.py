@@ -23,6 +23,27 @@ USED: Final = tuple(kind for kind in Quality if kind is not Quality.NONE)
 
 
 @dataclass(frozen=True, slots=True)
+class Tied:
+    """Poses that were adjusted together, as an engine takes them that knows what lies between one and the next.
+
+    Attributes
+    ----------
+    step : ndarray, shape (n, 6)
+        From the stated pose to the adjusted one: place [m] and turn in the local frame [rad].
+    own, shared : ndarray, shape (n, 6, 6)
+        Covariance of the adjusted pose: what is its own, and what it shares with those before and after it.
+    """
+
+    step: Array
+    own: Array
+    shared: Array
+
+    def rows(self, chosen: Any) -> "Tied":
+        """The rows of a slice, a mask or an index."""
+        return Tied(self.step[chosen], self.own[chosen], self.shared[chosen])
+
+
+@dataclass(frozen=True, slots=True)
 class OutsideFixes:
     """Positions of a point of the airframe in a local frame.
 
@@ -50,6 +71,8 @@ class OutsideFixes:
         Positions not taken, by reason; those of the reader included.
     cross_covariance_m_rad : ndarray, shape (n, 3, 3), or None
         Of position (rows) with that rotation vector (columns), in the local frame: the covariance of a pose is then a full 6 x 6.
+    tied : Tied, optional
+        Where poses were adjusted together; `position_m` and the covariances are then what each gained by that alone.
     """
 
     source: str
@@ -64,6 +87,7 @@ class OutsideFixes:
     attitude_covariance_rad2: Array | None
     left_out: dict[str, int]
     cross_covariance_m_rad: Array | None = None
+    tied: Tied | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -79,7 +103,8 @@ class OutsideFixes:
             int(np.searchsorted(self.time_ns, start_ns)), int(np.searchsorted(self.time_ns, end_ns, side="right"))
         )
         named: dict[str, Any] = {name: getattr(self, name) for name in _PER_ROW}
-        return dataclasses.replace(self, **{name: value[chosen] for name, value in named.items() if value is not None})
+        part = {name: value[chosen] for name, value in named.items() if value is not None}
+        return dataclasses.replace(self, **part, tied=None if self.tied is None else self.tied.rows(chosen))
 
 
 _PER_ROW: Final = (

@@ -21,12 +21,13 @@ from groundproc.estimation import direct, filtered, ins, methods, ownsolution
 from groundproc.estimation.inertial import readings
 from groundproc.estimation.inertial.solution import Solution, solve
 from groundproc.estimation.method import Given, gather
+from groundproc.estimation.observations.outside import shared
 from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, POSITION
 from groundproc.flight import autopilot
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight
 from groundproc.flight.pairing import legs
-from groundproc.flight.positions.fixes import OutsideFixes
+from groundproc.flight.positions.fixes import OutsideFixes, Tied
 from groundproc.geodesy import LocalFrame
 from groundproc.survey import Survey
 from groundproc.trajectory.trajectory import Trajectory
@@ -329,6 +330,45 @@ def outside(flown: Flown, frame: LocalFrame, lever_m: Array, every_s: float, sig
         None,
         {},
     )
+
+
+def test_poses_that_were_adjusted_together_keep_their_shape_and_say_what_they_share(ordinary: list[Flown]) -> None:
+    flown, off_m, own_m = ordinary[0], np.array([0.05, -0.04, 0.06]), 0.003
+    with given_of(flown.simulated.log) as given:
+        plain = outside(flown, given.frame, np.zeros(3), 2.0, own_m)
+        stated = flown.simulated.poses[500::1000]
+        mat = frames.mat_local_ins(*(np.deg2rad(stated[n]) for n in ("heading_deg", "pitch_deg", "roll_deg")))
+        count = len(stated)
+        own = np.diag([own_m**2] * 3 + [np.deg2rad(0.02) ** 2] * 3)
+        shared = np.diag([*np.square(off_m), *[np.deg2rad(0.05) ** 2] * 3])
+        # where a pose stands by itself is of no account here, and as it is said to be metres away it would show
+        step = np.tile([-3.0, 2.0, -1.0, 0.0, 0.0, 0.0], (count, 1))
+        tied = Tied(step, np.tile(own, (count, 1, 1)), np.tile(shared, (count, 1, 1)))
+        poses = replace(
+            plain, position_m=plain.position_m + off_m - step[:, :3], quat_local_ins_wxyz=frames.quat_from_mat(mat),
+            attitude_covariance_rad2=np.tile(np.eye(3), (count, 1, 1)), tied=tied,
+        )  # fmt: skip
+        estimate = filtered.filtered_estimate(given, quiet, [poses])
+        found = errors(estimate.trajectory, flown.simulated, given.frame)
+    inside = (found.time_s > 3.0) & (found.time_s < SECONDS - 4.0)
+    # the inertial sensors carry it two seconds from pose to pose; 3 m are what the fixes are off
+    assert np.abs(found.position[inside].mean(axis=0) - off_m).max() < 0.015
+    assert (found.position[inside] - off_m).std(axis=0).max() < 0.03
+    sigma = found.sigma_position[inside]
+    assert (sigma > 0.98 * np.abs(off_m)).all()
+    assert (sigma.mean(axis=0) < 1.3 * np.abs(off_m)).all()
+
+
+def test_what_tied_poses_share_fades_where_there_are_none(ordinary: list[Flown]) -> None:
+    with given_of(ordinary[0].simulated.log) as given:
+        plain = outside(ordinary[0], given.frame, np.zeros(3), 2.0, 0.01)
+    some = plain.between(int(plain.time_ns[3]), int(plain.time_ns[5]))
+    part = np.linspace(1.0, 3.0, 3)[:, None, None] * np.eye(6)
+    tied = replace(some, tied=Tied(np.zeros((3, 6)), np.tile(np.eye(6), (3, 1, 1)), part))
+    first, last = int(some.time_ns[0]), int(some.time_ns[-1])
+    asked = np.array([first, (first + last) // 2, last, last + 20 * 10**9, first - 200 * 10**9])
+    found = shared([plain, tied], asked)
+    np.testing.assert_allclose(found[:, 0, 0], [1.0, 2.0, 3.0, 3.0 / np.e, 0.0], atol=1e-4)
 
 
 def test_a_better_receiver_gives_its_accuracy(ordinary: list[Flown]) -> None:
