@@ -49,6 +49,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "onboard/gate.py": ("tests/onboard/test_gate.py",),
     "onboard/logfolder.py": ("tests/onboard/test_space.py", "tests/onboard/test_recorder.py", "tests/onboard/test_leftovers.py"),
     "onboard/parameter_link.py": ("tests/onboard/test_parameters.py",),
+    "onboard/spacewatch.py": ("tests/onboard/test_space.py",),
     "onboard/recorder.py": ("tests/onboard/test_recorder.py", "tests/onboard/test_space.py", "tests/onboard/test_slow_disk.py"),
     "flightlog/vehicles.py": ("tests/flightlog/test_vehicles.py",),
     "flightlog/words.py": ("tests/flightlog/test_words.py",),

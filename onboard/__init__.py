@@ -28,7 +28,8 @@ announce        what the ground station is told (pure)
 readings        the receivers' counters -> the status
 preflight       the checks before a flight
 backlog         what the disk has not taken yet, bounded
-recorder        backlog -> segments of the flight log, synced to the disk twice a second; watches free space
+recorder        backlog -> segments of the flight log, synced to the disk twice a second
+spacewatch      whether there is room on the disk for it
 segment         one file of the flight log, until it is read-only and in the manifest
 logfolder       names, manifest, space
 leftovers       logs that a power cut left open, mended while recording goes on

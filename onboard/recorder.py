@@ -28,6 +28,7 @@ from onboard.config import RecorderConfig
 from onboard.journal import event
 from onboard.logfolder import Space
 from onboard.segment import Segment, Where
+from onboard.spacewatch import SpaceWatch
 from onboard.worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ class Recorder(Worker):
         self._folders = [Path(config.directory), *map(Path, config.folders)]
         self._directory = self._folders[0]
         self._sync_ns = config.sync_ms * NS_PER_MS
-        self._floor_bytes = config.min_free_mb << 20
+        self._space = SpaceWatch(config)
         self._rotation_asked = threading.Event()
         self._retry_ns = 0
         self._told_drops = 0
@@ -336,39 +337,16 @@ class Recorder(Worker):
 
     def _stop_for_space(self) -> None:
         """The disk is full, whatever its free space said before."""
-        self._set_space(Space.FULL)
+        self.counts.space = self._space.note(Space.FULL)
         self._retry_ns = time.monotonic_ns() + _RETRY_NS
         self.counts.last_sync_ns = time.monotonic_ns()
         self._close_segment()
 
     def _look_at_space(self) -> None:
-        if time.monotonic_ns() < self._retry_ns:
-            return
-        if self._judge() is not Space.ROOM and self._config.prune_acknowledged:
-            with contextlib.suppress(OSError):  # a disk that does not let us delete is told by the writing
-                logfolder.prune(self._directory, lambda: self._judge() is Space.ROOM)
-        self._set_space(self._judge())
-
-    def _judge(self) -> Space:
-        try:
-            free_bytes = logfolder.free_bytes(self._directory)
-        except OSError:  # it is made with the next segment, or that says what is wrong
-            return Space.ROOM
-        return logfolder.space(free_bytes, self._floor_bytes, self.counts.space)
-
-    def _set_space(self, space: Space) -> None:
-        if space is not self.counts.space:
-            _log.log(*_SPACE_NEWS[space], extra=event("space", space=space.value))
-        self.counts.space = space
+        if time.monotonic_ns() >= self._retry_ns:
+            self.counts.space = self._space.look(self._directory)
 
 
 def _is_full(error: BaseException | None) -> bool:
     """Whether the disk is full, as opposed to failed."""
     return isinstance(error, OSError) and error.errno in _FULL
-
-
-_SPACE_NEWS: Final = {
-    Space.ROOM: (logging.WARNING, "there is room on the disk again: everything is recorded"),
-    Space.LOW: (logging.ERROR, "space on the disk is low: the lidar is not recorded any more"),
-    Space.FULL: (logging.CRITICAL, "the disk is full: the log is closed, nothing is recorded any more"),
-}

@@ -155,8 +155,8 @@ def _on_grid(track: GyroTrack) -> tuple[Array, Array]:
     before = np.clip(np.searchsorted(seconds, grid, side="right") - 1, 0, len(seconds) - 2)
     heard = seconds[before + 1] - seconds[before] <= max(1.0, 6.0 / max(track.rate_hz, 0.1))
     values[~heard] = np.median(track.rate_rad_s, axis=0)
-    # Gaussian filters: no delay, no ringing, and a median first, so that huge offsets leave no steps at the ends
-    values = low_pass(values - np.median(values, axis=0), COARSE_HZ, GRID_HZ)
+    # Gaussian filters: no delay, no ringing, and the ends held, so that huge offsets leave no steps there
+    values = low_pass(values, COARSE_HZ, GRID_HZ)
     values = values - low_pass(values, HIGH_PASS_HZ, GRID_HZ)
     values[~heard] = 0.0
     return values, heard.astype(np.float64)
