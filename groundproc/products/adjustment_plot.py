@@ -22,17 +22,21 @@ BLIND_BELOW: Final = 50
 """Matched clusters of a tenth of a second below which the lidar has next to no planes."""
 AXES_OF: Final = {
     "bias": ("x", "y", "z"), "scale": ("x", "y", "z"), "shear": ("yz", "zx", "xy"), "turn": ("x", "y", "z"),
-    "accel_bias": ("x", "y", "z"), "accel_turn": ("x", "y", "z"), "lever": ("x", "y", "z"),
+    "accel_bias": ("x", "y", "z"), "accel_scale": ("x", "y", "z"), "accel_shear": ("yz", "zx", "xy"), "accel_turn": ("x", "y", "z"),
+    "lever": ("x", "y", "z"),
     "compass": ("const", "sin", "cos", "sin2", "cos2"),
     "spin": ("x sin", "x cos", "y sin", "y cos", "z sin", "z cos"),
 }  # fmt: skip
 """What the numbers of an estimated parameter are of."""
 UNITS_OF: Final = {
-    "bias": "deg/s", "scale": "%", "shear": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_turn": "deg",
-    "lever": "cm", "delay": "ms", "drift": "ppm", "compass": "deg",
+    "bias": "deg/s", "scale": "%", "shear": "%", "turn": "deg", "accel_bias": "m/s^2", "accel_scale": "%",
+    "accel_shear": "%", "accel_turn": "deg", "lever": "cm", "delay": "ms", "drift": "ppm", "compass": "deg",
     "spin": "deg", "spin_share": "%",
 }  # fmt: skip
-FACTORS: Final = {"scale": 100.0, "spin_share": 100.0, "shear": 100.0, "lever": 100.0, "delay": 1000.0, "drift": 1e6}
+FACTORS: Final = {
+    "scale": 100.0, "spin_share": 100.0, "shear": 100.0, "accel_scale": 100.0, "accel_shear": 100.0, "lever": 100.0, "delay": 1000.0,
+    "drift": 1e6,
+}  # fmt: skip
 """From the unit of quality.json to that of the table, where they differ."""
 _TITLE: Final = 150
 """Characters that fit across the picture."""
@@ -230,6 +234,7 @@ def _table(sheet: Sheet) -> list[tuple[list[str], bool]]:
             "turn": "boresight" if key.startswith("ins.") else "misalignment",
             "lever": "place",
             "shear": "cross-axis",
+            "accel_shear": "accel cross-axis",
             "accel_turn": "accel misalignment",
         }.get(base, base)
         axes = AXES_OF.get(base, ("",))

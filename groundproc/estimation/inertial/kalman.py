@@ -214,7 +214,7 @@ def _smoothed(x: Array, p: Array, r: Array, out: Array) -> None:
 def _forward(motion: Motion, rows: Rows, start: Array, start_covariance: Array, blocks: Tape) -> float:
     """Filter the whole flight, keeping the states at the start of each block; gives the sum of the squared innovations."""
     first = rows.first
-    couple, defect, gain = np.empty((5, 3)), np.empty(POSE), np.empty(STATES)
+    couple, defect, gain = np.empty((6, 3)), np.empty(POSE), np.empty(STATES)
     x, p = start.copy(), start_covariance.copy()
     misfit = 0.0
     for k in range(len(motion.position_m)):
@@ -232,7 +232,7 @@ def _forward(motion: Motion, rows: Rows, start: Array, start_covariance: Array, 
 def _record(low: int, high: int, motion: Motion, rows: Rows, tape: Tape) -> None:
     """Filter one block again, keeping everything: states and covariances of its nodes, gains and innovations of its rows."""
     first = rows.first
-    couple, defect = np.empty((5, 3)), np.empty(POSE)
+    couple, defect = np.empty((6, 3)), np.empty(POSE)
     x, p = tape.states[0].copy(), tape.covariances[0].copy()
     base = first[low + 1]
     for k in range(low + 1, high + 1):
@@ -262,7 +262,7 @@ def _back(
     """
     r, n = adjoint
     first = rows.first
-    couple, defect, work, state = np.empty((5, 3)), np.empty(POSE), np.empty(STATES), np.empty(STATES)
+    couple, defect, work, state = np.empty((6, 3)), np.empty(POSE), np.empty(STATES), np.empty(STATES)
     base = first[low + 1]
     for k in range(high, low if low else -1, -1):
         p = tape.covariances[k - low]

@@ -11,6 +11,7 @@ from numba import njit
 from flightlog import frames
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.inertial import kalman
+from groundproc.estimation.inertial.imu import flat_low_pass
 from groundproc.estimation.inertial.readings import (
     UNKNOWN_FORCE_DENSITY,
     UNKNOWN_RATE_DENSITY,
@@ -51,6 +52,9 @@ ITERATIONS: Final = 6
 DONE_M: Final = 0.01
 DONE_RAD: Final = np.deg2rad(0.01)
 """Corrections under which the iteration ends."""
+STEADY_HZ: Final = 2.0
+"""Up to here scale and misalignment of the accelerometers are taken to act: an aircraft leans and climbs as slowly, what is faster shakes
+and moves nothing far."""
 KEPT_NS: Final = NS_PER_S // 10
 """Spacing of the states and covariances that are kept."""
 OUTLIER: Final = 4.0
@@ -318,6 +322,7 @@ def _smooth(
     lost = np.flatnonzero(~imu.force_known)
     gained = np.diff(reference.velocity_m_s, axis=0)[lost] / step_s[lost, None] + lift
     force[lost] = np.einsum("nji,nj->ni", frames.mat_from_quat(reference.quat[lost]), gained)
+    steady = flat_low_pass(force, STEADY_HZ, 1.0 / float(np.median(step_s)))
     start = np.zeros(STATES)
     start[POSITION : POSITION + 3] = first.position_m[0] - reference.position_m[0]
     start[VELOCITY : VELOCITY + 3] = first.velocity_m_s[0] - reference.velocity_m_s[0]
@@ -327,7 +332,7 @@ def _smooth(
     correction = np.empty((len(r.nodes_s), POSE))
     motion = Motion(
         reference.position_m, reference.velocity_m_s, reference.quat, step_s, imu.rate * step_s[:, None], force * step_s[:, None],
-        imu.rate_density, imu.force_density, r.gravity_m_s2, keep, drive,
+        steady * step_s[:, None], imu.rate_density, imu.force_density, r.gravity_m_s2, keep, drive,
     )  # fmt: skip
     out = kalman.Smoothed(stride, correction, residual, states, covariance, spread)
     kalman.smooth(

@@ -11,6 +11,7 @@ from groundproc.estimation.observations.states import (
     FIX_POSITION,
     FIX_VELOCITY,
     FORCE_BIAS,
+    FORCE_MATRIX,
     GYRO_BIAS,
     GYRO_MATRIX,
     HEADING,
@@ -38,6 +39,9 @@ class Motion(NamedTuple):
         Length of each step.
     angle_rad, push_m_s : ndarray, shape (n - 1, 3)
         Angle turned in it, and specific force times its length, in the ins frame.
+    steady_m_s : ndarray, shape (n - 1, 3)
+        The same push without what shakes: what scale and misalignment of the accelerometers act on. Of a noisy reading they would explain
+        its noise by itself.
     rate_density, force_density : ndarray, shape (n - 1,)
         Power spectral density of the noise of both [rad^2/s], [m^2/s^3].
     gravity_m_s2 : float
@@ -54,6 +58,7 @@ class Motion(NamedTuple):
     step_s: Array
     angle_rad: Array
     push_m_s: Array
+    steady_m_s: Array
     rate_density: Array
     force_density: Array
     gravity_m_s2: float
@@ -65,7 +70,8 @@ class Motion(NamedTuple):
 def step(k: int, motion: Motion, couple: Array, defect: Array) -> None:
     """What couples the states over the step from node k to the next, and by how much the reference misses it.
 
-    couple[0]: force times step turned into the local frame; couple[1:4]: matrix of the step's middle; couple[4]: angles turned.
+    couple[0]: force times step turned into the local frame; couple[1:4]: matrix of the step's middle; couple[4]: angles turned; couple[5]:
+    steady force times step.
     """
     position, velocity, quat = motion.position_m, motion.velocity_m_s, motion.quat
     angle, push = motion.angle_rad, motion.push_m_s
@@ -76,6 +82,7 @@ def step(k: int, motion: Motion, couple: Array, defect: Array) -> None:
     for i in range(3):
         couple[0, i] = mat[i, 0] * push[k, 0] + mat[i, 1] * push[k, 1] + mat[i, 2] * push[k, 2]
         couple[4, i] = angle[k, i]
+        couple[5, i] = motion.steady_m_s[k, i]
     gained = couple[0].copy()
     gained[2] -= motion.gravity_m_s2 * dt
     for i in range(3):
@@ -98,10 +105,16 @@ def forward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
             [couple[0, 1], -couple[0, 0], 0.0],
         ]
     )
-    read = np.empty((3, columns))
+    read, felt = np.empty((3, columns)), np.empty((3, columns))
     for i in range(3):
-        row = GYRO_MATRIX + 3 * i
+        row, force_row = GYRO_MATRIX + 3 * i, FORCE_MATRIX + 3 * i
         for j in range(columns):
+            felt[i, j] = (
+                dt * m[FORCE_BIAS + i, j]
+                + couple[5, 0] * m[force_row, j]
+                + couple[5, 1] * m[force_row + 1, j]
+                + couple[5, 2] * m[force_row + 2, j]
+            )
             read[i, j] = (
                 dt * m[GYRO_BIAS + i, j]
                 + couple[4, 0] * m[row, j]
@@ -114,12 +127,9 @@ def forward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
                 turn[i, 0] * m[ATTITUDE, j]
                 + turn[i, 1] * m[ATTITUDE + 1, j]
                 + turn[i, 2] * m[ATTITUDE + 2, j]
-                - dt
-                * (
-                    couple[1 + i, 0] * m[FORCE_BIAS, j]
-                    + couple[1 + i, 1] * m[FORCE_BIAS + 1, j]
-                    + couple[1 + i, 2] * m[FORCE_BIAS + 2, j]
-                )
+                - couple[1 + i, 0] * felt[0, j]
+                - couple[1 + i, 1] * felt[1, j]
+                - couple[1 + i, 2] * felt[2, j]
             )
             m[POSITION + i, j] += dt * (m[VELOCITY + i, j] + 0.5 * pushed)
             m[VELOCITY + i, j] += pushed
@@ -157,11 +167,13 @@ def backward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
                 couple[1, i] * m[ATTITUDE, j] + couple[2, i] * m[ATTITUDE + 1, j] + couple[3, i] * m[ATTITUDE + 2, j]
             )
     for i in range(3):
-        row = GYRO_MATRIX + 3 * i
+        row, force_row = GYRO_MATRIX + 3 * i, FORCE_MATRIX + 3 * i
         for j in range(columns):
-            m[FORCE_BIAS + i, j] -= dt * (
-                couple[1, i] * push[0, j] + couple[2, i] * push[1, j] + couple[3, i] * push[2, j]
-            )
+            pushed = couple[1, i] * push[0, j] + couple[2, i] * push[1, j] + couple[3, i] * push[2, j]
+            m[FORCE_BIAS + i, j] -= dt * pushed
+            m[force_row, j] -= couple[5, 0] * pushed
+            m[force_row + 1, j] -= couple[5, 1] * pushed
+            m[force_row + 2, j] -= couple[5, 2] * pushed
             m[GYRO_BIAS + i, j] -= dt * swung[i, j]
             m[row, j] -= couple[4, 0] * swung[i, j]
             m[row + 1, j] -= couple[4, 1] * swung[i, j]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from groundproc.estimation.observations.rows import Errors, Factor, H, RowBuilder, Unknowns, cross, eye
-from groundproc.estimation.observations.unit import Unit
+from groundproc.estimation.observations.unit import Unit, shearing
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path, integrated
 
@@ -63,9 +63,7 @@ def turn_factor(unit: Unit, path: Path, unknowns: Unknowns, spin_rad: Array | No
     if f"{name}.scale" in unknowns.names:
         builder.by(row, f"{name}.scale", np.einsum("ni,ij->nij", turned, np.eye(3)))
     if f"{name}.shear" in unknowns.names:
-        x, y, z = turned.T
-        none = np.zeros_like(x)
-        builder.by(row, f"{name}.shear", np.stack([none, z, y, z, none, x, y, x, none], axis=1).reshape(-1, 3, 3))
+        builder.by(row, f"{name}.shear", shearing(turned))
     if f"{name}.turn" in unknowns.names:
         builder.by(row, f"{name}.turn", cross(turned))
     if f"{name}.delay" in unknowns.names:

@@ -21,10 +21,12 @@ Array = npt.NDArray[np.float64]
 PRIORS: Final[dict[str, float]] = gyro.PRIORS | accelerometer.PRIORS | {"ins.delay": 0.01, "ins.drift": 60e-6}
 """What is known before, one sigma, of the globals by their names. The lidar's own unit has the lidar's clock; of the autopilot's are
 unknown the delay beyond the synchronisation's [s] and how it drifts, two crystals against each other [s/s]."""
-ORDER: Final = ("bias", "scale", "shear", "turn", "accel_bias", "accel_turn", "lever", "delay", "drift")
+ORDER: Final = (
+    "bias", "scale", "shear", "turn", "accel_bias", "accel_scale", "accel_shear", "accel_turn", "lever", "delay", "drift",
+)  # fmt: skip
 UNITS: Final = {
-    "bias": "deg_s", "scale": "", "shear": "", "turn": "deg", "accel_bias": "m_s2", "accel_turn": "deg", "lever": "m", "delay": "s",
-    "drift": "",
+    "bias": "deg_s", "scale": "", "shear": "", "turn": "deg", "accel_bias": "m_s2", "accel_scale": "", "accel_shear": "",
+    "accel_turn": "deg", "lever": "m", "delay": "s", "drift": "",
 }  # fmt: skip
 """Of the globals in reports."""
 LEAST_SHARE: Final = 0.4

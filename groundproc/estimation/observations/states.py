@@ -24,25 +24,27 @@ FORCE_BIAS: Final = 12
 """Reading less truth, ins frame [m/s^2], 3."""
 GYRO_MATRIX: Final = 15
 """Reading less truth for each unit of rate, row by row: scale on the diagonal, misalignment off it, ins frame, 9."""
-FIX_POSITION: Final = 24
+FORCE_MATRIX: Final = 24
+"""Reading less truth for each unit of specific force, row by row: scale on the diagonal, misalignment off it, ins frame, 9."""
+FIX_POSITION: Final = 33
 """Correlated error of the position fixes [m], 3."""
-FIX_VELOCITY: Final = 27
+FIX_VELOCITY: Final = 36
 """Correlated error of the velocities that come with them [m/s], 3."""
-FIX_AGE: Final = 30
+FIX_AGE: Final = 39
 """How much older fixes are than their stamps [s]."""
-TILT: Final = 31
+TILT: Final = 40
 """Error of the autopilot's pitch and roll [rad], 2: about the right and the forward axis of the heading."""
-HEADING: Final = 33
+HEADING: Final = 42
 """What of the error of its heading is no function of heading [rad], clockwise."""
-COMPASS: Final = 34
+COMPASS: Final = 43
 """The compass curve [rad]: constant, sine and cosine of the heading, sine and cosine of twice the heading, 5."""
-BARO: Final = 39
+BARO: Final = 48
 """Error of the barometer's height [m]."""
-COURSE: Final = 40
+COURSE: Final = 49
 """Angle from the direction a vehicle drives to its heading [rad], clockwise."""
-OUTSIDE: Final = 41
+OUTSIDE: Final = 50
 """Correlated error of the positions of a better receiver [m], 3."""
-STATES: Final = 44
+STATES: Final = 53
 POSE: Final = 9
 """The first so many are position, velocity and attitude."""
 
@@ -61,6 +63,8 @@ class Model:
         The same of the accelerometers [m/s^2], [m/s^2/sqrt(s)].
     gyro_scale, gyro_misalignment : float
         Relative, and [rad].
+    force_scale, force_misalignment : float
+        The same of the accelerometers: of MEMS as sold 3 % and 2 %, and half of that and less once calibrated on six sides.
     fix_tau_s, fix_velocity_tau_s : float
         GM error of positions (sigma: as the fixes state it) and of velocities.
     fix_velocity_m_s : float
@@ -88,6 +92,8 @@ class Model:
     force_bias_walk: float = 0.002
     gyro_scale: float = 0.01
     gyro_misalignment: float = 0.01
+    force_scale: float = 0.015
+    force_misalignment: float = np.deg2rad(0.7)
     fix_tau_s: float = 60.0
     fix_velocity_tau_s: float = 1.5
     fix_velocity_m_s: float = 0.3
@@ -119,6 +125,8 @@ def start_covariance(model: Model, fix_sigma_m: Array, linked: bool, outside_sig
     sigma[FORCE_BIAS : FORCE_BIAS + 3] = model.force_bias_m_s2
     sigma[GYRO_MATRIX : GYRO_MATRIX + 9] = model.gyro_misalignment
     sigma[GYRO_MATRIX : GYRO_MATRIX + 9 : 4] = model.gyro_scale
+    sigma[FORCE_MATRIX : FORCE_MATRIX + 9] = model.force_misalignment
+    sigma[FORCE_MATRIX : FORCE_MATRIX + 9 : 4] = model.force_scale
     sigma[FIX_POSITION : FIX_POSITION + 3] = fix_sigma_m
     sigma[FIX_VELOCITY : FIX_VELOCITY + 3] = fix_velocity_sigma(model, fix_sigma_m, linked)
     sigma[FIX_AGE] = model.fix_age_s

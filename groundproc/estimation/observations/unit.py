@@ -28,8 +28,8 @@ class Unit:
         As measured, in the sensor frame by the nominal mount.
     known, force_known : ndarray of bool, shape (n STEPS,)
     values : dict of str to ndarray
-        bias [rad/s], scale, shear, turn [rad], delay [s], accel_bias [m/s^2], accel_turn [rad], lever [m], drift
-        of the delay [s/s]: what has been taken off so far. The delay is that in the middle of the path.
+        bias [rad/s], scale, shear, turn [rad], delay [s], accel_bias [m/s^2], accel_scale, accel_shear, accel_turn [rad],
+        lever [m], drift of the delay [s/s]: what has been taken off so far. The delay is that in the middle of the path.
     sigma_turn_rad, sigma_force_m_s2 : float
         Noise of an increment over a slice; of the mean force about a knot.
     """
@@ -54,6 +54,13 @@ def sheared(shear: Array) -> Array:
     """Symmetric matrix, shape (3, 3), of what a sensor feels of the two other axes: yz, zx, xy."""
     yz, zx, xy = shear
     return np.array([[0.0, xy, zx], [xy, 0.0, yz], [zx, yz, 0.0]])
+
+
+def shearing(values: Array) -> Array:
+    """What the three numbers of `sheared` do to vectors: matrices, shape (n, 3, 3), for values of shape (n, 3)."""
+    x, y, z = values.T
+    none = np.zeros_like(x)
+    return np.stack([none, z, y, z, none, x, y, x, none], axis=1).reshape(-1, 3, 3)
 
 
 def place_on_grid(unit: Unit, track: ImuTrack, path: Path) -> None:
@@ -84,7 +91,8 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
     """A unit with nothing estimated yet but its gyro's bias."""
     values = {
         "bias": bias.copy(), "scale": np.zeros(3), "shear": np.zeros(3), "turn": np.zeros(3), "delay": np.zeros(1),
-        "drift": np.zeros(1),        "accel_bias": np.zeros(3), "accel_turn": np.zeros(3), "lever": lever.copy(),
+        "drift": np.zeros(1), "accel_bias": np.zeros(3), "accel_scale": np.zeros(3), "accel_shear": np.zeros(3),
+        "accel_turn": np.zeros(3), "lever": lever.copy(),
     }  # fmt: skip
     none = np.zeros((0, 3))
     unit = Unit(
