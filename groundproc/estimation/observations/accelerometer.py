@@ -13,12 +13,13 @@ from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 NAMES: Final = ("accel_bias", "accel_scale", "accel_shear", "accel_turn", "lever")
 PRIORS: Final[dict[str, float]] = {
     "lidar.accel_bias": 0.5, "lidar.accel_scale": 0.015, "lidar.accel_shear": np.deg2rad(0.5), "lidar.accel_turn": np.deg2rad(0.5),
     "lidar.lever": 0.15,
-    "ins.accel_bias": 0.5, "ins.accel_scale": 0.015, "ins.accel_shear": np.deg2rad(0.5), "ins.accel_turn": np.deg2rad(0.5),
+    "ins.accel_bias": 0.15, "ins.accel_scale": 0.015, "ins.accel_shear": np.deg2rad(0.5), "ins.accel_turn": np.deg2rad(0.5),
     "ins.lever": 0.05,
 }  # fmt: skip
 """What is known before, one sigma: bias [m/s^2], scale, what an axis feels of the two others, misalignment against the gyro [rad], place
@@ -28,6 +29,21 @@ STEADY_KNOTS: Final = 5.0
 noise that is in it, and come out too large."""
 _HAT: Final = np.concatenate([np.arange(STEPS) + 0.5, np.arange(STEPS)[::-1] + 0.5]) / STEPS
 """Weight of each grid step in the second difference of positions about a knot."""
+
+
+def steady_force(force_m_s2: Array) -> Array:
+    """Mean force of each slice, smoothed, shape (slices, 3)."""
+    return np.asarray(
+        gaussian_filter1d(force_m_s2.reshape(-1, STEPS, 3).mean(axis=1), STEADY_KNOTS, axis=0, mode="nearest")
+    )
+
+
+def _add_scales(builder: RowBuilder, row: Ints, name: str, mat_local_unit: Array, force_m_s2: Array) -> None:
+    """Columns of scale and cross-axis terms, which act on the axes of the unit."""
+    if f"{name}.accel_scale" in builder.unknowns.names:
+        builder.by(row, f"{name}.accel_scale", mat_local_unit * force_m_s2[:, None, :])
+    if f"{name}.accel_shear" in builder.unknowns.names:
+        builder.by(row, f"{name}.accel_shear", mat_local_unit @ shearing(force_m_s2))
 
 
 def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
@@ -64,11 +80,7 @@ def force_factor(unit: Unit, path: Path, unknowns: Unknowns) -> Factor:
     builder.by(row, f"{unit.name}.accel_bias", mean_mat)
     for name in ("turn", "accel_turn"):
         builder.by(row, f"{unit.name}.{name}", mean_mat @ cross(mean_force))
-    steady = gaussian_filter1d(own.reshape(-1, STEPS, 3).mean(axis=1), STEADY_KNOTS, axis=0, mode="nearest")[knot]
-    if f"{unit.name}.accel_scale" in unknowns.names:
-        builder.by(row, f"{unit.name}.accel_scale", mean_mat @ turn * steady[:, None, :])
-    if f"{unit.name}.accel_shear" in unknowns.names:
-        builder.by(row, f"{unit.name}.accel_shear", mean_mat @ turn @ shearing(steady))
+    _add_scales(builder, row, unit.name, mean_mat @ turn, steady_force(own)[knot])
     builder.by(row, "world.turn", np.tile(-cross(GRAVITY[None])[0], (len(good), 1, 1)))
     if f"{unit.name}.lever" in unknowns.names:
         at = mats[::STEPS]
