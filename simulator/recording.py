@@ -55,10 +55,12 @@ class Recording:
         self._pcap = PcapWriter(self._open(parts[CAPTURE]), self._options.capture_resolution)
         self._tlog = self._open(parts[TLOG])
         job = simulation.job
-        self._board = BoardLog(
-            self._open(parts[BOARD]), simulation.ins, simulation.clocks, job.options, simulation.origin, job.seed,
-            simulation.noted,
-        )  # fmt: skip
+        self._board = None
+        if BOARD in parts:
+            self._board = BoardLog(
+                self._open(parts[BOARD]), simulation.ins, simulation.clocks, job.options, simulation.origin, job.seed,
+                simulation.noted,
+            )  # fmt: skip
         self._poses = self._files.enter_context(parts[POSES].open("w", encoding="utf-8"))
         self._poses.write(COLUMNS + "\n")
         self._points = self._files.enter_context(PointsWriter(self._open(parts[POINTS]))) if POINTS in parts else None
@@ -94,7 +96,8 @@ class Recording:
         rate_hz = self._options.truth_hz
         grid = np.arange(np.ceil(start_s * rate_hz - 1e-9), np.ceil(end_s * rate_hz - 1e-9)) / rate_hz
         simulation = self._simulation
-        self._board.add(start_s, end_s, chunk)
+        if self._board is not None:
+            self._board.add(start_s, end_s, chunk)
         write_poses(self._poses, simulation.flight, simulation.clocks, simulation.origin, grid)
 
     def _arrival_ns(self, sent_s: Array, rng: np.random.Generator) -> npt.NDArray[np.int64]:

@@ -23,6 +23,32 @@ settings.load_profile("swath")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+LONGEST = (
+    "end_to_end/test_adjusted.py",
+    "groundproc/steps/test_steps.py",
+    "end_to_end/test_process.py",
+    "groundproc/strips/test_adjust_command.py",
+    "end_to_end/test_live.py",
+    "groundproc/estimation/test_filtered.py",
+    "end_to_end/test_adjusted_anchored.py",
+    "groundproc/steps/test_images.py",
+    "end_to_end/test_calibrate.py",
+    "end_to_end/test_estimate_folder.py",
+    "end_to_end/test_full_disk.py",
+    "groundproc/campaign/test_batch.py",
+    "end_to_end/test_adjusted_natural.py",
+    "end_to_end/test_dynamic.py",
+    "groundproc/analysis/test_section_and_fuse.py",
+    "groundproc/commands/test_other_systems.py",
+)
+"""Files that take half a minute and more, the longest first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files begin: one that came last would keep one worker while the other is idle."""
+    rank = {Path(__file__).parent / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
 
 @dataclass(frozen=True)
 class Simulated:
@@ -66,29 +92,42 @@ class Simulated:
         return float(boot["start_ns"] * 1e-9 + elapsed_s * (1 + boot["drift_ppm"] * 1e-6) - lidar_s)
 
 
-def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int, points: bool) -> None:
+def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, every: int, *more: str) -> None:
     """All files of a simulation, with the lidar's data packets of one 0.1 s in `every` only: rays are what costs."""
-    from simulator.recording import BOARD, CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Recording
+    from simulator.recording import CAPTURE, LOG, POINTS, POSES, TLOG, TRUTH, Recording
     from simulator.simulation import Job, Simulation
     from simulator.truth import write_json
 
     simulation = Simulation(Job(scene, seconds, seed, folder, options))
-    names = [LOG, CAPTURE, TLOG, BOARD, POSES] + [POINTS] * points
-    with Recording(simulation, {name: folder / name for name in names}) as recording:
+    with Recording(simulation, {name: folder / name for name in (LOG, CAPTURE, TLOG, POSES, *more)}) as recording:
         for chunk in range(simulation.chunks):
-            recording.add(chunk, simulation.sweep(chunk) if chunk % every == 0 else simulation.lidar.sweep(0, 0))
+            sweep = simulation.lidar.sweep(0, 0) if chunk % every else simulation.sweep(chunk, POINTS in more)
+            recording.add(chunk, sweep)
     write_json(folder / TRUTH, simulation.truth())
 
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulated]:
-    """A function that simulates: simulated(name, scene, seconds, options, seed=..., every=..., points=...); the name is its folder."""
+    """A function that simulates: simulated(name, scene, seconds, options, seed=..., every=...); the name is its folder.
+
+    What takes long and is asked for rarely is made on demand: points=True the true echoes, board=True the board's own log.
+    """
+    from simulator.recording import BOARD, POINTS
+
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "simulated"
     shared.mkdir(exist_ok=True)
 
     def get(
-        name: str, scene: str, seconds: float, options: Any, *, seed: int = 5, every: int = 1, points: bool = False
+        name: str,
+        scene: str,
+        seconds: float,
+        options: Any,
+        *,
+        seed: int = 5,
+        every: int = 1,
+        points: bool = False,
+        board: bool = False,
     ) -> Simulated:
         folder, done = shared / name, shared / f"{name}.done"
         try:
@@ -99,7 +138,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulat
                 assert time.monotonic() < deadline, f"{name}: the worker that simulates it has not finished in 900 s"
                 time.sleep(0.1)
             return Simulated(folder)
-        _render(folder, scene, seconds, seed, options, every, points)
+        _render(folder, scene, seconds, seed, options, every, *[POINTS] * points, *[BOARD] * board)
         done.touch()
         return Simulated(folder)
 
@@ -121,7 +160,7 @@ def plain_flight(simulated: Callable[..., Simulated]) -> Simulated:
     """25 s round the village, with all errors and no GPS on the lidar: its clock counts from power-on."""
     from simulator.config import Options
 
-    return simulated("plain_flight", "village", 25.0, Options(), every=10)
+    return simulated("plain_flight", "village", 25.0, Options(), every=10, board=True)
 
 
 @pytest.fixture(scope="session")

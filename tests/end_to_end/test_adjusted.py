@@ -193,6 +193,8 @@ def test_nothing_of_the_future_costs_centimetres(flight: Any, whole: Judged) -> 
     assert whole.figures["ate_m"] < made.figures["ate_m"] <= 0.05
 
 
+# a second whole adjustment; in the quick suite a cluster's products are those of here byte by byte, by the autopilot's solution
+@pytest.mark.soak
 def test_runs_are_alike(flight: Any, whole: Judged) -> None:
     """Sums over cores are of fixed parts: the same log gives the same trajectory, to rounding."""
     again = judged(flight.folder, Survey(method="adjusted"))
@@ -210,6 +212,8 @@ def rms_of(found: Sequence[Judged], figure: str) -> float:
     return float(np.sqrt(np.mean([each.figures[figure] ** 2 for each in found])))
 
 
+# two flights of their own; in the quick suite the meadow's flat ground is held to the truth, and sigmas of the village's are
+@pytest.mark.soak
 def test_over_a_flat_field_the_place_is_no_worse_than_the_autopilots(hovered: list[tuple[Judged, Judged]]) -> None:
     """Only height and tilt have a witness; the place stays what it was, to a hundredth of its error, and its sigma says so."""
     raw, made = zip(*hovered, strict=True)
@@ -219,6 +223,7 @@ def test_over_a_flat_field_the_place_is_no_worse_than_the_autopilots(hovered: li
     assert all(np.median(each.estimate.trajectory.sigma_position_m[:, :2]) > 0.5 for each in made)
 
 
+@pytest.mark.soak
 def test_over_a_flat_field_the_heading_is_no_worse_than_the_autopilots(hovered: list[tuple[Judged, Judged]]) -> None:
     raw, made = zip(*hovered, strict=True)
     assert rms_of(made, "rotation_rms_deg") <= rms_of(raw, "rotation_rms_deg")

@@ -248,6 +248,8 @@ def test_check_points_are_the_figure_for_users(controlled: Made) -> None:
     assert control["used"]["after_rms_m"] < 2.0 * control["used"]["sigma_m"]
 
 
+# in the quick suite: windows that are joined (test_adjusted), and control that holds the whole of one (above)
+@pytest.mark.soak
 def test_control_holds_a_flight_of_several_windows(flight: Any, tmp_path: Path) -> None:
     """Windows of 8 s, joined: the control is the joining's."""
     rng = np.random.default_rng(8)

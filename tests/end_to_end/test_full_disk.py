@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 import seeds
@@ -29,12 +30,16 @@ SOME = ("--method", "ins", "--products", "cloud.laz,density.tif")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log, a cut one, a capture, a cloud with its trajectory: outside of the disk that will be full."""
     folder = tmp_path_factory.mktemp("inputs")
-    write_flight(folder / "a.mcap", 4.0)
+    write_flight(folder / "a.mcap", 3.0)
+    write_flight(folder / "short.mcap", 2.0)
     content = (folder / "a.mcap").read_bytes()
     (folder / "cut.mcap").write_bytes(content[: len(content) * 4 // 5])
     (folder / "a.pcap").write_bytes(seeds.pcap(1000))
     (folder / "a.tlog.gz").write_bytes(gzip.compress(seeds.tlog() * 500))
     assert main(["process", str(folder / "a.mcap"), "-o", str(folder / "out"), *SOME]) in (0, 3)
+    few = laspy.read(folder / "out" / "cloud.laz")
+    few.points = few.points[::12].copy()
+    few.write(folder / "few.laz")
     return folder
 
 
@@ -64,10 +69,10 @@ COMMANDS: dict[str, tuple[list[str], int]] = {
     "recover": (["recover", "IN/cut.mcap", "-o", "DISK/new/whole.mcap"], 256),
     "process, the cloud": (["process", "IN/a.mcap", *SOME, "-o", "DISK/new/out"], 1500),
     "process, the first step": (["process", "IN/a.mcap", "--method", "ins", "-o", "DISK/new/out"], 16),
-    "adjust": (["adjust", "IN/out/cloud.laz", "-t", "IN/out/trajectory.csv", "-o", "DISK/new/out"], 256),
+    "adjust": (["adjust", "IN/few.laz", "-t", "IN/out/trajectory.csv", "-o", "DISK/new/out"], 256),
     "import": (["import", "--pcap", "IN/a.pcap", "-o", "DISK/new/a.mcap"], 0),
     "import, packed": (["import", "--pcap", "IN/a.pcap", "--mavlink", "IN/a.tlog.gz", "-o", "DISK/new/a.mcap"], 16),
-    "calibrate": (["calibrate", "IN/a.mcap", "-o", "DISK/new/out"], 0),
+    "calibrate": (["calibrate", "IN/short.mcap", "-o", "DISK/new/out"], 0),
     "init": (["init", "IN/a.mcap", "-o", "DISK/new/survey.yaml"], 0),
     "simulate": (["simulate", "--dark", "--duration", "2", "-o", "DISK/new"], 256),
     "live": (["live", "--follow", "IN/a.mcap", "--port", "0", "--idle", "3", "-o", "DISK/new"], 0),

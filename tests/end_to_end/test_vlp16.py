@@ -37,7 +37,8 @@ def disguised(log: Path, output: Path) -> None:
 def test_a_flight_with_it_is_processed_by_receive_times(plain_flight: Any, tmp_path: Path) -> None:
     log, out = tmp_path / "v.mcap", tmp_path / "out"
     disguised(plain_flight.log, log)
-    assert main(["process", str(log), "-o", str(out), "--method", "ins", "--fov", "all"]) == 3  # by receive times
+    words = ["--method", "ins", "--fov", "all", "--products", "cloud.laz"]
+    assert main(["process", str(log), "-o", str(out), *words]) == 3  # by receive times
     quality = json.loads((out / "quality.json").read_text())
     assert quality["lidar"]["model"] == "VLP-16"
     assert quality["sync"]["method"] == "host"

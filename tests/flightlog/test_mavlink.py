@@ -15,10 +15,12 @@ TLOGS = ["arducopter313_sim.tlog", "ardusub_2023.tlog", "copter_flight_2015.tlog
 
 
 class Witness(NamedTuple):
-    """What pymavlink's own log reader finds: the stream without its stamps, and the messages it takes for good."""
+    """What pymavlink's own log reader finds: the stream without its stamps, and the messages it takes for good; and what we do."""
 
     stream: list[tuple[int, bytes]]
     messages: list[tuple[int, Any]]
+    frames: list[Frame]
+    """Those that our parser knows of the stream."""
 
 
 @pytest.fixture(scope="module", params=TLOGS)
@@ -38,7 +40,7 @@ def witness(request: pytest.FixtureRequest, recordings: Path) -> Witness:
             stream.append((time_ns, bytes(message.get_msgbuf())))
             messages.append((time_ns, message))
     log.close()
-    return Witness(stream, messages)
+    return Witness(stream, messages, known(stream))
 
 
 def parsed(pieces: list[tuple[int, bytes]]) -> list[Frame]:
@@ -60,11 +62,11 @@ def known(pieces: list[tuple[int, bytes]]) -> list[Frame]:
 def test_the_frames_of_a_recording_are_those_that_pymavlink_finds(witness: Witness) -> None:
     theirs = [(time_ns, bytes(message.get_msgbuf())) for time_ns, message in witness.messages]
     assert len(theirs) > 25_000
-    assert [(frame.time_ns, frame.data) for frame in known(witness.stream)] == theirs
+    assert [(frame.time_ns, frame.data) for frame in witness.frames] == theirs
 
 
 def test_where_the_stream_was_cut_makes_no_difference(witness: Witness) -> None:
-    whole = known(witness.stream)
+    whole = witness.frames
     bytes_of = [(time_ns, data[i : i + 1]) for time_ns, data in witness.stream[:3000] for i in range(len(data))]
     assert known(bytes_of) == known(witness.stream[:3000])
     joined = b"".join(data for _, data in witness.stream)
@@ -74,7 +76,7 @@ def test_where_the_stream_was_cut_makes_no_difference(witness: Witness) -> None:
 
 
 def test_every_field_of_every_message_is_what_pymavlink_reads(witness: Witness) -> None:
-    frames = known(witness.stream)
+    frames = witness.frames
     kinds = {message.get_type() for _, message in witness.messages}
     assert {"ATTITUDE", "GLOBAL_POSITION_INT", "RAW_IMU", "GPS_RAW_INT", "SYSTEM_TIME", "STATUSTEXT"} <= kinds
     for kind in kinds:
@@ -93,7 +95,7 @@ def test_every_field_of_every_message_is_what_pymavlink_reads(witness: Witness) 
 
 
 def test_a_frame_decodes_to_pymavlinks_message(witness: Witness) -> None:
-    frames = known(witness.stream)
+    frames = witness.frames
     for frame, (_, theirs) in list(zip(frames, witness.messages, strict=True))[::50]:
         ours = mavlink.decode(frame)
         assert ours is not None
@@ -111,7 +113,7 @@ def test_the_autopilot_is_told_from_ground_stations_and_companions(witness: Witn
     }
     assert any(autopilot == 8 for autopilot in senders.values()) or len(senders) == 1
     heard = Vehicles()
-    for frame in known(witness.stream):
+    for frame in witness.frames:
         heard.hear(frame)
     assert heard.vehicles() == [who for who, what in senders.items() if what != 8]
 

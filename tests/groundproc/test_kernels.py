@@ -1,7 +1,7 @@
 """House rules of numba kernels, and of the constant that stood in a dozen places, read from the source of the package."""
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import groundproc
@@ -11,17 +11,22 @@ MOST = 8
 """Parameters of a kernel: what belongs together is passed as a named tuple of arrays, with documented fields."""
 
 
-def sources() -> Iterator[tuple[str, ast.Module]]:
-    for path in sorted(PACKAGE.rglob("*.py")):
-        yield path.relative_to(PACKAGE).as_posix(), ast.parse(path.read_text())
+@cache
+def sources() -> list[tuple[str, ast.Module]]:
+    return [
+        (path.relative_to(PACKAGE).as_posix(), ast.parse(path.read_text())) for path in sorted(PACKAGE.rglob("*.py"))
+    ]
 
 
-def kernels() -> Iterator[tuple[str, ast.FunctionDef]]:
+@cache
+def kernels() -> list[tuple[str, ast.FunctionDef]]:
     """All functions that numba compiles, as "file:name"."""
-    for name, tree in sources():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(one) for one in node.decorator_list):
-                yield f"{name}:{node.name}", node
+    return [
+        (f"{name}:{node.name}", node)
+        for name, tree in sources()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(one) for one in node.decorator_list)
+    ]
 
 
 def parameters(node: ast.FunctionDef) -> list[ast.arg]:

@@ -132,7 +132,7 @@ def test_an_eight_turns_both_ways_and_crosses_itself():
 def test_water_returns_hardly_anything_and_the_shore_does(simulate):
     options = Options()
     sights = {
-        route: simulate("lake", 2.0, replace(options, flight=FlightOptions(route=route)), points=True)
+        route: simulate("lake", 1.0, replace(options, flight=FlightOptions(route=route)), points=True)
         for route in ("open", "out")
     }
     shots = {route: recorded.shots.payloads.shape[0] * 384 for route, recorded in sights.items()}

@@ -4,6 +4,7 @@ import gzip
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -109,21 +110,24 @@ class Flown:
     simulated: Any
     ins: Errors
     filtered: Errors
-    solution: Solution
     report: dict[str, Any]
+
+    @cached_property
+    def solution(self) -> Solution:
+        """All states of the flight's log as it is, which takes as long as the estimate: for who looks at them."""
+        with given_of(self.simulated.log) as given:
+            return filtered.solve_leg(given, given.placed[0], given.fixes[0])
 
 
 def fly(simulated: Any, change: Callable[[Flight], None] | None = None) -> Flown:
     with given_of(simulated.log, change) as given:
         raw = direct.ins_estimate(given, quiet).trajectory
         estimate = filtered.filtered_estimate(given, quiet)
-        solution = filtered.solve_leg(given, given.placed[0], given.fixes[0])
     assert estimate.warning == ""
     return Flown(
         simulated,
         errors(raw, simulated, raw.frame),
         errors(estimate.trajectory, simulated, raw.frame),
-        solution,
         estimate.report["legs"][0],
     )
 

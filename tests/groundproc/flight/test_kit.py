@@ -96,7 +96,8 @@ def test_the_flight_is_processed_and_its_points_are_true_to_what_the_positions_a
     kit: linekit.Kit, log: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    assert main(["process", str(log), "-o", str(out), "--height", "ellipsoid", "--crs", "32633"]) == 0
+    words = ["--height", "ellipsoid", "--crs", "32633", "--products", "cloud.laz"]
+    assert main(["process", str(log), "-o", str(out), *words]) == 0
     quality = json.loads((out / "quality.json").read_text())
     assert quality["trajectory"]["method"] == "filtered"
     assert "not adjusted, because a line scanner has 1 laser" in quality["trajectory"]["note"]

@@ -89,7 +89,9 @@ def test_a_flight_with_attitudes_that_are_no_number_is_the_flight_without_them(
         assert main(["import", "--pcap", str(case / "l.pcap"), "--mavlink", str(telemetry), "-o", str(log)]) == 0
         assert main(["info", str(log)]) == 0
         assert ("left out              3 ATTITUDE" in capsys.readouterr().out) is (name == "with")
-        assert main(["process", str(log), "-o", str(folder), "--method", "ins"]) == 3  # no mount, and short
+        assert (
+            main(["process", str(log), "-o", str(folder), "--method", "ins", "--products", "cloud.laz"]) == 3
+        )  # no mount, and short
         told = json.loads((folder / "quality.json").read_text())
         assert told["autopilot"]["impossible"] == ({"ATTITUDE": 3} if name == "with" else {})
         clouds.append(laspy.read(folder / "cloud.laz").xyz)

@@ -15,6 +15,9 @@ from groundproc.cli import main
 from groundproc.strips import work
 from groundproc.strips.correction import Correction
 
+SHORT = [(-40.0, 0.0), (40.0, 0.0), (40.0, 10.0), (-40.0, 10.0)]
+"""There and back: enough to adjust, not to judge by."""
+
 
 def test_strips_that_lay_decimetres_apart_lie_on_each_other(adjusted: Any) -> None:
     assert adjusted.code == 0
@@ -221,6 +224,8 @@ def test_several_files_with_seconds_of_the_week_and_their_own_strips(
     assert told["points"]["outside_trajectory"] == 0
 
 
+# in the quick suite: how an SBET is read (trajectory), and that any trajectory that is read is adjusted (here)
+@pytest.mark.soak
 def test_an_sbet_is_a_trajectory_too(tmp_path: Path, wrong_scan: aerial.Scan, adjusted: Any) -> None:
     flight = wrong_scan.wrong
     lat, lon, convergence = aerial.geodetic(flight.place_m)
@@ -263,7 +268,7 @@ def test_positions_alone_do_for_the_splines(tmp_path: Path, adjust: Callable[...
 
 
 def test_a_worse_result_is_refused_and_leaves_nothing(
-    tmp_path: Path, true_scan: aerial.Scan, adjust: Callable[..., Any], monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, adjust: Callable[..., Any], monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     right = work.adjust
@@ -277,7 +282,7 @@ def test_a_worse_result_is_refused_and_leaves_nothing(
         return made
 
     monkeypatch.setattr(work, "adjust", worse)
-    outcome = adjust(tmp_path, true_scan)
+    outcome = adjust(tmp_path, aerial.scanned(aerial.flown(SHORT), aerial.Errors(), rate_hz=1500))
     assert outcome.code == 1
     said = capsys.readouterr().err
     assert "self-check" in said
@@ -348,10 +353,18 @@ def test_the_corrected_file_is_of_the_same_crs_for_others(adjusted: Any) -> None
     assert crs.equals(pyproj.CRS.from_epsg(aerial.EPSG))
 
 
-@pytest.mark.parametrize(("version", "point_format"), [("1.2", 1), ("1.3", 3), ("1.4", 6), ("1.4", 8)])
+@pytest.mark.parametrize(
+    ("version", "point_format"),
+    [
+        ("1.2", 1),
+        pytest.param("1.3", 3, marks=pytest.mark.soak),  # as 1.2, and the flags of its format as in 1.4
+        pytest.param("1.4", 6, marks=pytest.mark.soak),
+        ("1.4", 8),
+    ],
+)
 def test_files_of_all_versions_keep_what_they_hold(tmp_path: Path, version: str, point_format: int) -> None:
     """Scaled extra bytes, extended records and odd scales too."""
-    scan = aerial.scanned(aerial.flown([(-40, 0), (40, 0), (40, 10), (-40, 10)]), aerial.Errors(0.1), rate_hz=1500)
+    scan = aerial.scanned(aerial.flown(SHORT), aerial.Errors(0.1), rate_hz=1500)
     header = laspy.LasHeader(version=version, point_format=point_format)
     header.scales, header.offsets = np.array([0.01, 0.001, 0.0005]), np.array([500_000.0, 6_400_000.0, 0.0])
     header.add_extra_dim(
@@ -385,15 +398,16 @@ def test_files_of_all_versions_keep_what_they_hold(tmp_path: Path, version: str,
         assert [v.record_data for v in new.evlrs if v.user_id == "somebody"] == [bytes(range(256)) * 300]
 
 
-def test_options_are_listed_and_wrong_ones_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], adjusted: Any
-) -> None:
+def test_options_are_listed_and_wrong_ones_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["adjust", "--show-config"]) == 0
     shown = capsys.readouterr().out
     assert "knots_s: 2.0" in shown
     (tmp_path / "all.yaml").write_text(shown)
     (tmp_path / "bad.yaml").write_text("knots_s: 0")
-    cloud, track = adjusted.folder.parent / "cloud.laz", adjusted.folder.parent / "given.csv"
+    cloud, track = tmp_path / "cloud.laz", tmp_path / "given.csv"
+    scan = aerial.scanned(aerial.flown(SHORT), aerial.Errors(0.1), rate_hz=1500)
+    aerial.write_las(cloud, scan, scan.placed_m)
+    aerial.write_csv(track, scan.wrong)
     words = [str(cloud), "-t", str(track), "-o", str(tmp_path / "out")]
     assert main(["adjust", *words, "--config", str(tmp_path / "bad.yaml")]) == 2
     assert "knots_s: 0" in capsys.readouterr().err
