@@ -32,7 +32,6 @@ LONGEST = (
     "groundproc/estimation/test_filtered.py",
     "end_to_end/test_adjusted_anchored.py",
     "groundproc/steps/test_images.py",
-    "end_to_end/test_calibrate.py",
     "end_to_end/test_estimate_folder.py",
     "end_to_end/test_full_disk.py",
     "groundproc/campaign/test_batch.py",

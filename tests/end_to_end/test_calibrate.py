@@ -62,6 +62,10 @@ def made_with(folder: Path, survey: Survey, compass: Path | None = None) -> tupl
         return estimate, judge(cloud, truth, placed, estimate.mount, lasers).figures
 
 
+# A flight of its own and a whole adjustment. In the quick suite: offsets within their sigma and the curve of a compass, from
+# observations made up (observations/test_lasers, test_dynamic), what the command says (test_calibrate_command), and a flight
+# whose lasers are estimated and told (test_estimate_folder).
+@pytest.mark.soak
 def test_offsets_of_the_lasers_are_found_within_their_sigma(made: Path, flight: Any) -> None:
     """A bias is what a range is too long by, and an elevation error what a laser looks too high: corrections take off and add."""
     found, report = read_lasers(made / "lasers.yaml"), json.loads((made / "calibration.json").read_text())["lasers"]
@@ -107,6 +111,7 @@ def test_processing_finds_the_same_lasers_by_itself(made: Path, flight: Any) -> 
     assert_sharper(before, itself)
 
 
+@pytest.mark.soak
 def test_the_compass_curve_holds_where_it_was_flown_and_says_where_it_was_not(made: Path, flight: Any) -> None:
     report = json.loads((made / "calibration.json").read_text())["compass"]
     assert (made / "compass.yaml").exists() == report["found"]
@@ -129,6 +134,7 @@ def test_the_compass_curve_holds_where_it_was_flown_and_says_where_it_was_not(ma
     assert "of all headings flown" in (made / "compass.yaml").read_text().splitlines()[1]
 
 
+@pytest.mark.soak
 def test_headings_of_the_autopilot_are_mended_by_the_file(made: Path, flight: Any) -> None:
     """Its compass is off by 8 deg and more, over part of the circle; what an AHRS sways by on its own, 1 deg, stays."""
     _, before = made_with(flight.folder, Survey(method="ins"))
@@ -137,13 +143,13 @@ def test_headings_of_the_autopilot_are_mended_by_the_file(made: Path, flight: An
 
 
 def test_an_estimate_is_asked_of_the_adjustment_only(
-    flight: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    gps_flight: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["process", str(flight.log), "--lasers", "estimate", "-o", str(tmp_path / "out")]
+    words = ["process", str(gps_flight.log), "--lasers", "estimate", "-o", str(tmp_path / "out")]
     for more in (["--method", "filtered"], ["--causal"]):
         assert main([*words, *more]) == 2
         assert "only method adjusted finds them" in capfd.readouterr().err
-    lost = ["process", str(flight.log), "--lasers", str(tmp_path / "none.yaml"), "-o", str(tmp_path / "out")]
+    lost = ["process", str(gps_flight.log), "--lasers", str(tmp_path / "none.yaml"), "-o", str(tmp_path / "out")]
     assert main(lost) != 0
     assert "none.yaml: cannot be read" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -87,6 +87,8 @@ def test_the_heading_is_mended_within_seconds_of_driving(driven: Any, made: Path
     assert abs(report["course"]["trim_minus_course_median_deg"]) < ERROR_DEG
 
 
+# in the quick suite: the curve of runs that are made up, written and read (estimation/test_dynamic)
+@pytest.mark.soak
 def test_the_compass_model_begins_the_next_run(driven: Any, made: Path, tmp_path: Path) -> None:
     model = tmp_path / "compass.yaml"
     assert main(["compass", str(made), "-o", str(model), "--harmonics", "0"]) == 0

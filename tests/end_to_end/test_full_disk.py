@@ -31,7 +31,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log, a cut one, a capture, a cloud with its trajectory: outside of the disk that will be full."""
     folder = tmp_path_factory.mktemp("inputs")
     write_flight(folder / "a.mcap", 3.0)
-    write_flight(folder / "short.mcap", 2.0)
+    write_flight(folder / "short.mcap", 2.5)
     content = (folder / "a.mcap").read_bytes()
     (folder / "cut.mcap").write_bytes(content[: len(content) * 4 // 5])
     (folder / "a.pcap").write_bytes(seeds.pcap(1000))
