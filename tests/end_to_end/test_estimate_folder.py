@@ -11,25 +11,43 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from flightlog.logfile import LogReader, LogWriter
 from groundproc.cli import main
 from groundproc.trajectory.estimate import read_estimate
 
 Array = npt.NDArray[np.float64]
 
 
+SECONDS = 11.0
+"""Gyros tie clocks from 10 s on; what is estimated must differ from what was given, and need not be good."""
+
+
 @pytest.fixture(scope="module")
 def flight(simulated: Callable[..., Any]) -> Any:
-    """A boresight that is off by up to a degree, as a lever arm and the lasers are."""
+    """A boresight that is off by up to a degree."""
     from simulator.plans import plan
 
     return simulated("adjusted_flight", "village", 20.0, plan("survey_fast_gyro").options, seed=11, points=True)
 
 
 @pytest.fixture(scope="module")
-def direct(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The beginning of it."""
+    path: Path = tmp_path_factory.mktemp("begun") / "flight.mcap"
+    with LogReader(flight.log) as reader, path.open("wb") as stream:
+        writer = LogWriter(stream, metadata=dict(reader.metadata), attachments=dict(reader.attachments))
+        for message in reader.messages():
+            if message.log_time_ns < reader.start_ns + SECONDS * 1e9:
+                writer.write(message.topic, message.log_time_ns, bytes(message.data))
+        writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def direct(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The products of a run that estimates all there is: mount and lasers too."""
     return processed(
-        flight.log,
+        log,
         tmp_path_factory.mktemp("direct") / "out",
         "--method",
         "adjusted",
@@ -61,10 +79,10 @@ def quality(folder: Path) -> dict[str, Any]:
 
 
 def test_the_cloud_of_the_folder_is_the_cloud(
-    flight: Any, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    log: Path, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """To the last bit; and the folder that this makes is as good as the first."""
-    new = again(flight.log, tmp_path / "out", direct / "trajectory.csv")
+    new = again(log, tmp_path / "out", direct / "trajectory.csv")
     said = capsys.readouterr().out
     assert "mount estimated by adjusted, begun from log" in said
     for name in ("cloud.laz", "trajectory.npz", "mount.yaml", "lasers.yaml", "ties.yaml"):
@@ -85,13 +103,13 @@ def test_which_mount_was_used_and_that_it_was_estimated_is_said(direct: Path) ->
     assert 0.0 < max(mount["sigma"]["turn_deg"]) < 1.0
 
 
-def test_rows_that_were_changed_are_placed_to_a_millimetre(flight: Any, direct: Path, tmp_path: Path) -> None:
+def test_rows_that_were_changed_are_placed_to_a_millimetre(log: Path, direct: Path, tmp_path: Path) -> None:
     """An empty line makes it another file: its decimals are then all there is of the poses."""
     folder = tmp_path / "changed"
     shutil.copytree(direct, folder)
     with (folder / "trajectory.csv").open("a") as file:
         file.write("\n")
-    new = again(flight.log, tmp_path / "out", folder)
+    new = again(log, tmp_path / "out", folder)
     moved = np.linalg.norm(points(new) - points(direct), axis=1)
     assert np.median(moved) < 0.0005
     # 0.1 mm of the row, 5e-6 deg at 100 m, and the cloud's own millimetre in three axes
@@ -100,13 +118,13 @@ def test_rows_that_were_changed_are_placed_to_a_millimetre(flight: Any, direct: 
 
 
 def test_a_trajectory_that_lies_alone_is_taken_with_the_mount_of_the_log_and_that_is_said(
-    flight: Any, direct: Path, tmp_path: Path
+    log: Path, direct: Path, tmp_path: Path
 ) -> None:
     """What the folder is for: without it points move by decimetres."""
     shutil.copy(direct / "trajectory.csv", tmp_path / "trajectory.csv")
-    # doubtful: by a mount that is decimetres off the beams of one pass go through the points of another
     words = ["--trajectory", str(tmp_path / "trajectory.csv"), "--products", "cloud.laz", "-o", str(tmp_path / "out")]
-    assert main(["process", str(flight.log), *words]) == 3
+    # whether it is doubted is the matter of the whole flight, below: in its beginning no place is passed twice
+    assert main(["process", str(log), *words]) in (0, 3)
     alone = tmp_path / "out"
     moved = np.linalg.norm(points(alone) - points(direct), axis=1)
     assert np.median(moved) > 0.02
@@ -115,7 +133,16 @@ def test_a_trajectory_that_lies_alone_is_taken_with_the_mount_of_the_log_and_tha
     assert "lies alone" in quality(alone)["trajectory"]["note"]
 
 
-def test_clock_and_lasers_are_those_of_the_folder(flight: Any, direct: Path, tmp_path: Path) -> None:
+@pytest.mark.soak
+def test_a_trajectory_alone_is_doubted_where_places_are_passed_twice(flight: Any, tmp_path: Path) -> None:
+    """By a mount that is decimetres off the beams of one pass go through the points of another."""
+    made = processed(flight.log, tmp_path / "made", "--method", "adjusted", "--products", "cloud.laz")
+    shutil.copy(made / "trajectory.csv", tmp_path / "trajectory.csv")
+    words = ["--trajectory", str(tmp_path / "trajectory.csv"), "--products", "cloud.laz", "-o", str(tmp_path / "out")]
+    assert main(["process", str(flight.log), *words]) == 3
+
+
+def test_clock_and_lasers_are_those_of_the_folder(log: Path, direct: Path, tmp_path: Path) -> None:
     """A clock that is 20 ms late gives the same points later stamps; ranges that are 0.3 m too long move them by that."""
     folder = tmp_path / "changed"
     shutil.copytree(direct, folder)
@@ -125,7 +152,7 @@ def test_clock_and_lasers_are_those_of_the_folder(flight: Any, direct: Path, tmp
     assert text.count(str(offset_ns)) == 1
     ties.write_text(text.replace(str(offset_ns), str(offset_ns + 20_000_000)))
     (folder / "lasers.yaml").write_text("range_m: [" + ", ".join(["0.3"] * 32) + "]\n")
-    late = again(flight.log, tmp_path / "late", folder)
+    late = again(log, tmp_path / "late", folder)
     new_s, old_s = (np.asarray(laspy.read(each / "cloud.laz").gps_time) for each in (late, direct))
     new_s = new_s - 0.02
     # all but the shots at the ends of the trajectory are in both clouds; stamps are right to 0.1 us
@@ -155,12 +182,12 @@ def test_the_sigmas_are_the_roots_of_the_written_covariances(direct: Path) -> No
 
 @pytest.mark.parametrize("name", ["mount.yaml", "covariance.npz", "report.json"])
 def test_a_folder_that_is_not_whole_is_refused_in_one_sentence(
-    flight: Any, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+    log: Path, direct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     folder = tmp_path / "cut"
     shutil.copytree(direct, folder)
     (folder / name).unlink()
-    assert main(["process", str(flight.log), "--trajectory", str(folder), "-o", str(tmp_path / "out")]) != 0
+    assert main(["process", str(log), "--trajectory", str(folder), "-o", str(tmp_path / "out")]) != 0
     said = capsys.readouterr().err
     assert name in said
     assert said.count("\n") == 1
