@@ -60,7 +60,7 @@ def radial(kind: int, lens: Array, q: float) -> tuple[float, float]:
     return q * (1.0 + s * (k1 + s * (k2 + s * k3))), 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _bent(lens: Array, x: float, y: float, sign: float) -> tuple[float, float]:
     """Brown's distortion of (x, y) alone; `sign` as of `brown`."""
     p, q = (lens[6], lens[7]) if sign > 0.0 else (lens[7], lens[6])
@@ -206,40 +206,50 @@ def _undone(lens: Array, sign: float, x: float, y: float, out: Array) -> bool:
     return False
 
 
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def placed(kind: int, lens: Array, x: float, y: float, z: float) -> tuple[bool, float, float]:
+    """Pixel of a ray, as numbers: for millions of points; False where the model does not reach."""
+    a, b = 0.0, 0.0
+    if kind == RADTAN:
+        reached = z > 0.0 and x * x + y * y <= lens[FARTHEST] * lens[FARTHEST] * z * z
+        if reached:
+            a, b = _bent(lens, x / z, y / z, 1.0)
+    elif kind == PHOTOGRAMMETRIC:
+        reached, a, b = _corrected(lens, x, y, z)
+    else:
+        across = np.sqrt(x * x + y * y)
+        angle = np.arctan2(across, z)
+        reached = angle <= lens[FARTHEST]
+        if reached:
+            distance, slope = radial(kind, lens, angle)
+            share = distance / across if across >= 1e-9 * abs(z) else slope / z
+            a, b = share * x, share * y
+    return (
+        reached,
+        lens[FOCAL] * a + lens[SKEW] * b + lens[PU],
+        lens[FOCAL] * lens[ASPECT] * b + lens[SKEW + 1] * a + lens[PV],
+    )
+
+
+@njit(cache=True, nogil=True)
+def _corrected(lens: Array, x: float, y: float, z: float) -> tuple[bool, float, float]:
+    """Where the plane at distance 1 is measured whose corrected place is that of a ray, before focal length and aspect (no skew)."""
+    if z <= 0.0:
+        return False, 0.0, 0.0
+    along, down = lens[FOCAL] * lens[PIXEL_MM], lens[FOCAL] * lens[ASPECT] * lens[PIXEL_MM]
+    measured = np.zeros(2)
+    if not _undone(lens, -1.0, along * x / z, -down * y / z, measured):
+        return False, 0.0, 0.0
+    return True, measured[0] / along, -measured[1] / down
+
+
 @njit(cache=True, nogil=True)
 def projected(kind: int, lens: Array, ray: Array, out: Array) -> bool:
     """Pixel of a ray; False where the model does not reach."""
-    if kind == RADTAN:  # the usual one, for millions of points: without derivatives
-        if ray[2] <= 0.0:
-            return False
-        a, b = ray[0] / ray[2], ray[1] / ray[2]
-        if a * a + b * b > lens[FARTHEST] * lens[FARTHEST]:
-            return False
-        a, b = _bent(lens, a, b, 1.0)
-        out[0] = lens[FOCAL] * a + lens[SKEW] * b + lens[PU]
-        out[1] = lens[FOCAL] * lens[ASPECT] * b + lens[SKEW + 1] * a + lens[PV]
-        return True
-    if kind != PHOTOGRAMMETRIC:
-        across = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1])
-        angle = np.arctan2(across, ray[2])
-        if angle > lens[FARTHEST]:
-            return False
-        distance, slope = radial(kind, lens, angle)
-        share = distance / across if across >= 1e-9 * abs(ray[2]) else slope / ray[2]
-        a, b = share * ray[0], share * ray[1]
-        out[0] = lens[FOCAL] * a + lens[SKEW] * b + lens[PU]
-        out[1] = lens[FOCAL] * lens[ASPECT] * b + lens[SKEW + 1] * a + lens[PV]
-        return True
-    place, jac, unused = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 5))
-    if not distorted(kind, lens, ray, place, jac, unused):
-        return False
-    focal, aspect = lens[FOCAL], lens[ASPECT]
-    millimetre = lens[PIXEL_MM]
-    measured = np.zeros(2)
-    if not _undone(lens, -1.0, focal * place[0] * millimetre, -focal * aspect * place[1] * millimetre, measured):
-        return False
-    out[0], out[1] = lens[PU] + measured[0] / millimetre, lens[PV] - measured[1] / millimetre
-    return True
+    reached, u, v = placed(kind, lens, ray[0], ray[1], ray[2])
+    if reached:
+        out[0], out[1] = u, v
+    return reached
 
 
 @njit(cache=True, nogil=True)

@@ -134,6 +134,21 @@ def _encoded(light: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     )
 
 
+def degrees_of(response: Any) -> tuple[float, float]:
+    """Scale and offset of `response: {scale: S, offset: O}`: degrees Celsius are S times the number plus O.
+
+    Raises
+    ------
+    UsageError
+    """
+    if response is None:
+        return 1.0, 0.0
+    try:
+        return float(response.get("scale", 1.0)), float(response.get("offset", 0.0))
+    except (AttributeError, TypeError, ValueError):
+        raise UsageError(f"rig: response: {response!r} found, expected {{scale: S, offset: O}}") from None
+
+
 def response_of(camera: RigCamera) -> tuple[str, Array | None]:
     """The curve of `response`, and the matrix that takes other bands out of each, if any.
 

@@ -46,6 +46,8 @@ class Band:
         Stored where there is no value; None: every cell has one.
     resampling : str
         How overviews are made: "average" for what varies smoothly, "nearest" for what may not be mixed.
+    scale, offset : float
+        The quantity is so many times the stored number, plus the offset: as programs show it.
     """
 
     name: str
@@ -53,6 +55,8 @@ class Band:
     dtype: str = "float32"
     no_data: float | None = NO_DATA
     resampling: str = "average"
+    scale: float = 1.0
+    offset: float = 0.0
 
 
 def write(
@@ -235,6 +239,8 @@ def _describe(file: Any, bands: Sequence[Band]) -> None:
         file.set_band_description(number, band.name)
         if band.unit:
             file.set_band_unit(number, band.unit)
+    if any((band.scale, band.offset) != (1.0, 0.0) for band in bands):
+        file.scales, file.offsets = [band.scale for band in bands], [band.offset for band in bands]
     if len(bands) > 1:
         file.colorinterp = [colours.get(band.name, ColorInterp.undefined) for band in bands]
 

@@ -21,7 +21,7 @@ from groundproc.imagery.painting.paint import paint, part, room
 from groundproc.imagery.painting.scene import Scene, laid_out, mapped
 from groundproc.imagery.painting.score import Score, score, worst
 from groundproc.imagery.painting.views import Views, blend
-from groundproc.imagery.radiance import TEMPERATURE
+from groundproc.imagery.radiance import TEMPERATURE, degrees_of
 
 Progress = Callable[[str, int], object]
 Array = npt.NDArray[np.float64]
@@ -195,7 +195,7 @@ def _columns(
         found[TEMPERATURE][:] = np.nan  # where no image is asked
     differ = None
     if TEMPERATURE in layer.bands:
-        scale, _ = response_of(block.rig.cameras[layer.images[0].camera].response)
+        scale, _ = degrees_of(block.rig.cameras[layer.images[0].camera].response)
         differ = _DIFFER_K / abs(scale or 1.0)
     for square in scene.squares:
         values = blend(part(views, square.points), factor, layer.full, least, differ)
@@ -207,27 +207,12 @@ def _columns(
 def _scaled(block: Block, layer: Layer, band: str, values: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
     """Numbers of pictures as the attribute has them: colours over 16 bits, temperatures in degrees."""
     if band == TEMPERATURE:
-        scale, offset = response_of(block.rig.cameras[layer.images[0].camera].response)
+        scale, offset = degrees_of(block.rig.cameras[layer.images[0].camera].response)
         return np.asarray(scale * values + offset, np.float32)
     most = float(np.iinfo(np.uint16).max)
     with np.errstate(invalid="ignore"):
         steps = np.rint(np.clip(values / layer.full, 0.0, 1.0) * most)
     return np.where(np.isfinite(steps), steps, 0.0).astype(np.uint16)
-
-
-def response_of(response: Any) -> tuple[float, float]:
-    """Scale and offset of `response: {scale: S, offset: O}`: degrees Celsius are S times the number plus O.
-
-    Raises
-    ------
-    UsageError
-    """
-    if response is None:
-        return 1.0, 0.0
-    try:
-        return float(response.get("scale", 1.0)), float(response.get("offset", 0.0))
-    except (AttributeError, TypeError, ValueError):
-        raise UsageError(f"rig: response: {response!r} found, expected {{scale: S, offset: O}}") from None
 
 
 def _write(task: Task, cloud: reader.Cloud, columns: Mapping[str, npt.NDArray[Any]], progress: Progress) -> None:

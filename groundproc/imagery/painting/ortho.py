@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +19,7 @@ from groundproc.imagery.painting.mosaic import Mosaic, mosaic
 from groundproc.imagery.painting.scene import Scene, laid_out
 from groundproc.imagery.painting.surface import Surface, surface_of
 from groundproc.imagery.painting.views import NOBODY
+from groundproc.imagery.radiance import TEMPERATURE, degrees_of
 from groundproc.raster import geotiff
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
@@ -134,10 +135,10 @@ def ortho(task: Task, progress: Progress) -> Made:
         made = mosaic(
             block, layer, place.scene, place.surface, place.grid, place.folder, lambda n: progress("images", n)
         )
-        factor = gains(made.shared, len(layer.images), layer.full, measured=not task.balance)
+        factor = gains(made.shared, len(layer.images), layer.full, not task.balance or TEMPERATURE in layer.bands)
         crs = task.crs or place.cloud.crs
         with written_aside(task.output) as aside, written_aside(task.sources) as other:
-            bands = [Band(name, dtype=_dtype(layer).name, no_data=0) for name in layer.bands]
+            bands = [_band(block, layer, name) for name in layer.bands]
             geotiff.write(aside, made.grid, crs, bands, lambda window: _shown(made, layer, factor, window))
             source = Band("image", dtype="uint16", no_data=0, resampling="nearest")
             geotiff.write(other, made.grid, crs, source, lambda window: _number(made, window))
@@ -164,6 +165,15 @@ def _layer(block: Block, bands: Sequence[str]) -> Layer:
     listed = "; ".join(", ".join(names) for names in known)
     asked = f"bands {', '.join(wanted)}" if wanted else "no bands"
     raise UsageError(f"--bands: {asked} found, expected those of one kind of pictures: {listed}")
+
+
+def _band(block: Block, layer: Layer, name: str) -> Band:
+    """Of the raster; of temperatures it says how numbers become degrees."""
+    band = Band(name, dtype=_dtype(layer).name, no_data=0)
+    if name != TEMPERATURE:
+        return band
+    scale, offset = degrees_of(block.rig.cameras[layer.images[0].camera].response)
+    return replace(band, unit="degC", scale=scale, offset=offset)
 
 
 def _dtype(layer: Layer) -> np.dtype[Any]:

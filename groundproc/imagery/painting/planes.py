@@ -140,23 +140,23 @@ def _assign(xyz_m: Any, of_point: Any, cells: Any, usual_rough_m: float, score: 
     for i in range(len(xyz_m)):
         own = of_point[i]
         if good[own]:
-            _offer(xyz_m[i], cells, own, (True, usual_rough_m), score[i : i + 1], known, i)
+            _offer(xyz_m, cells, own, (True, usual_rough_m), score, known, i)
             continue
         if of_near != own:  # points of one cell often follow each other
             around(cells.keys, cells.table, own, near)
             of_near = own
         for c in near:
             if c >= 0:
-                _offer(xyz_m[i], cells, c, (c == own, usual_rough_m), score[i : i + 1], known, i)
+                _offer(xyz_m, cells, c, (c == own, usual_rough_m), score, known, i)
 
 
 @njit(cache=True, nogil=True)
-def _offer(place: Any, cells: Any, c: int, terms: Any, score: Any, known: Any, point: int) -> None:
+def _offer(xyz_m: Any, cells: Any, c: int, terms: Any, score: Any, known: Any, point: int) -> None:
     """Give a point the plane of a cell where it lies on it and this is more certain there than what it has."""
     own, usual_rough_m = terms
     square, off, away = 0.0, 0.0, 0.0
     for axis in range(3):
-        normal, way = cells.normal[c, axis], place[axis] - cells.middle_m[c, axis]
+        normal, way = cells.normal[c, axis], xyz_m[point, axis] - cells.middle_m[c, axis]
         square += normal * normal
         off += normal * way
         away += way * way
@@ -168,9 +168,9 @@ def _offer(place: Any, cells: Any, c: int, terms: Any, score: Any, known: Any, p
         return
     # rough planes of few points are uncertain, and those that the point lies away from
     found = (rough_m**2 * (1.0 + 12.0 * away / cells.size_m**2) + off * off) / cells.points[c] + rough_m**2
-    if found >= score[0]:
+    if found >= score[point]:
         return
-    score[0] = found
+    score[point] = found
     known.rough_m[point], known.above_m[point] = rough_m, off
     for axis in range(3):
         known.normal[point, axis] = cells.normal[c, axis]

@@ -86,7 +86,7 @@ def surface_of(cloud: reader.Cloud, spacing_m: float, least_m: float, all_classe
         cells.add(xyz_m, xyz_m[:, 2])
     grid = cells.grid()
     assert grid is not None
-    known = cells.window(grid, "max")
+    known = _topped(cells.window(grid, "max"))
     there = np.isfinite(known)
     filled = fill(known)
     height = np.where(ndimage.distance_transform_edt(~there) <= _BRIDGED, filled, np.nan).astype(np.float32)
@@ -95,3 +95,15 @@ def surface_of(cloud: reader.Cloud, spacing_m: float, least_m: float, all_classe
         high = filled - opened(filled, radius) > _OBJECT_M
     part, parts = ndimage.label(high & np.isfinite(height))
     return Surface(grid, height, part.astype(np.int32), int(parts))
+
+
+def _topped(known: Raster) -> Raster:
+    """Heights without those seen through gaps between the points of what stands above them: these cells are as if they were empty.
+
+    A roof of points at random leaves cells without any, and there the ground below it, seen from aside, would be the top. Such a gap is
+    deeper than a step below all around, and not three cells wide both ways.
+    """
+    high = ndimage.maximum_filter(np.where(np.isfinite(known), known, -np.inf), 3, mode="nearest")
+    closed = ndimage.minimum_filter(high, 3, mode="nearest")
+    with np.errstate(invalid="ignore"):
+        return np.where(closed - known > _STEP_M, np.nan, known).astype(np.float32)

@@ -26,6 +26,8 @@ UNSEEN: Final = 128
 _ROUGH_M: Final = 0.03
 _LEAST: Final = 0.05
 """Of the cosine to the normal: what is seen from the side counts little, and not nothing."""
+_LITTLE: Final = 0.25
+"""Of the best view's weight: one that may show its place twice as far off has no say."""
 _EVERY: Final = 37
 """Of the texels, one in so many tells exposures."""
 
@@ -109,12 +111,14 @@ def textured(
             eye = image.eye._replace(place_m=-way)
             seen = found[0].sees(project(eye, each.known.xyz_m), each.known, eye.place_m)
             if len(seen.number):
-                weight = weights(seen, camera.width_px, camera.height_px) * _facing(each.known, seen, eye.place_m)
+                weight = weights(seen, camera.width_px, camera.height_px) * _facing(
+                    each.known, seen, eye.place_m, camera.focal_px
+                )
                 insert(each.views, shown, seen, weight.astype(np.float32), number)
         progress(1)
     factor = gains(_sampled([each.views for each in texels]), len(layer.images), layer.full, measured=not balance)
     pictures = [
-        _picture(chart, blend(each.views, factor, layer.full, 1) * (255.0 / layer.full))
+        _picture(chart, blend(each.views, factor, layer.full, 1, little=_LITTLE) * (255.0 / layer.full))
         for chart, each in zip(made, texels, strict=True)
     ]
     total = sum(int(np.count_nonzero(each.views.total)) for each in texels)
@@ -137,11 +141,17 @@ def _texels(block: Block, layer: Layer, chart: Chart, sizes_m: tuple[float, floa
     return _Texels(known, centre, float(np.sqrt((local**2).sum(axis=1).max())), room(count, layer, folder))
 
 
-def _facing(known: Surface, seen: Seen, place_m: Array) -> npt.NDArray[np.float64]:
-    """Cosine of the angle between the normal and the way to the camera."""
+def _facing(known: Surface, seen: Seen, place_m: Array, focal_px: float) -> npt.NDArray[np.float64]:
+    """What a view of a texel weighs by the angle that it is seen at: as one over the square of how far off it may show its place.
+
+    That is a pixel, drawn out over the surface, and how exactly the surface lies where it is, drawn out more: a wall that is off by half a
+    cell shows the ground at its foot to who looks down along it.
+    """
     way = place_m - known.xyz_m[seen.number]
     cosine = (way * known.normal[seen.number]).sum(axis=1) / np.maximum(seen.range_m, 1e-6)
-    return np.asarray(np.clip(cosine, _LEAST, 1.0))
+    square = np.clip(cosine, _LEAST, 1.0) ** 2
+    pixels = known.rough_m[seen.number] * focal_px / np.maximum(seen.range_m, 1e-6)
+    return np.asarray(square / (1.0 + (1.0 - square) * pixels**2))
 
 
 def _sampled(views: Sequence[Views]) -> Views:

@@ -47,7 +47,12 @@ def insert(views: Views, picture: npt.NDArray[Any], seen: Seen, weight: npt.NDAr
 
 
 def blend(
-    views: Views, gain: npt.NDArray[np.float32], full: float, least: int, differ: float | None = None
+    views: Views,
+    gain: npt.NDArray[np.float32],
+    full: float,
+    least: int,
+    differ: float | None = None,
+    little: float = 0.0,
 ) -> npt.NDArray[np.float32]:
     """What the views of each point agree on.
 
@@ -62,6 +67,8 @@ def blend(
         Views that a point needs.
     differ : float, optional
         What views of one thing differ by anyway; default: a share of the full scale.
+    little : float
+        Views that weigh less than this share of the best one have no say: many that show a place badly would outvote it.
 
     Returns
     -------
@@ -69,7 +76,7 @@ def blend(
         Not a number where there are fewer.
     """
     out = np.full((len(views.total), views.value.shape[2]), np.nan, np.float32)
-    _blend(views, gain, _FLOOR * full if differ is None else differ, least, out)
+    _blend(views, gain, (_FLOOR * full if differ is None else differ, least, little), out)
     return out
 
 
@@ -82,28 +89,36 @@ def sampled(picture: npt.NDArray[Any], pixel: npt.NDArray[np.float32]) -> npt.ND
 
 @njit(cache=True, nogil=True)
 def _sampled(picture: Any, pixel: Any, out: Any) -> None:
-    for i in range(len(pixel)):
-        _between(picture, pixel[i, 0], pixel[i, 1], out[i])
-
-
-@njit(cache=True, nogil=True)
-def _between(picture: Any, u: float, v: float, out: Any) -> None:
-    """Bilinear interpolation; beyond the middles of the outermost pixels what these show."""
     height, width, planes = picture.shape
-    u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
+    for i in range(len(pixel)):
+        corner = _corner(pixel[i, 0], pixel[i, 1], width, height)
+        for plane in range(planes):
+            out[i, plane] = _between(picture, plane, corner)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _corner(u: float, v: float, width: int, height: int) -> tuple[int, int, int, int, float, float]:
+    """Rows above and below a place, columns left and right, and how far it is from the first of each.
+
+    Beyond the middles of the outermost pixels it is taken to be there.
+    """
+    u, v = min(max(np.float64(u), 0.0), width - 1.0), min(max(np.float64(v), 0.0), height - 1.0)
     column, row = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
-    a, b = u - column, v - row
-    below, beside = min(row + 1, height - 1), min(column + 1, width - 1)
-    for plane in range(planes):
-        upper = (1.0 - a) * picture[row, column, plane] + a * picture[row, beside, plane]
-        lower = (1.0 - a) * picture[below, column, plane] + a * picture[below, beside, plane]
-        out[plane] = (1.0 - b) * upper + b * lower
+    return row, min(row + 1, height - 1), column, min(column + 1, width - 1), u - column, v - row
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _between(picture: Any, plane: int, corner: Any) -> float:
+    """Bilinear interpolation."""
+    row, below, column, beside, a, b = corner
+    upper = (1.0 - a) * picture[row, column, plane] + a * picture[row, beside, plane]
+    lower = (1.0 - a) * picture[below, column, plane] + a * picture[below, beside, plane]
+    return float((1.0 - b) * upper + b * lower)
 
 
 @njit(cache=True, nogil=True)
 def _insert(views: Any, picture: Any, number: Any, pixel: Any, weight: Any, image: Any) -> None:
-    planes = picture.shape[2]
-    shown = np.empty(planes)
+    height, width, planes = picture.shape
     images, weights, values, total = views.image, views.weight, views.value, views.total
     most = images.shape[1]
     for i in range(len(number)):
@@ -122,11 +137,12 @@ def _insert(views: Any, picture: Any, number: Any, pixel: Any, weight: Any, imag
             continue
         for later in range(most - 1, place, -1):
             images[point, later], weights[point, later] = images[point, later - 1], weights[point, later - 1]
-            values[point, later] = values[point, later - 1]
+            for plane in range(planes):
+                values[point, later, plane] = values[point, later - 1, plane]
         images[point, place], weights[point, place] = image, weight[i]
-        _between(picture, pixel[i, 0], pixel[i, 1], shown)
+        corner = _corner(pixel[i, 0], pixel[i, 1], width, height)
         for plane in range(planes):
-            values[point, place, plane] = shown[plane]
+            values[point, place, plane] = _between(picture, plane, corner)
 
 
 @njit(cache=True, nogil=True)
@@ -160,7 +176,8 @@ def _vote(balanced: Any, count: int, floor: float, kept: Any, sorted_: Any) -> N
 
 
 @njit(cache=True, nogil=True)
-def _blend(views: Any, gain: Any, floor: float, least: int, out: Any) -> None:
+def _blend(views: Any, gain: Any, terms: Any, out: Any) -> None:
+    floor, least, little = terms
     images, weights, values, total = views.image, views.weight, views.value, views.total
     most, planes = values.shape[1], values.shape[2]
     balanced, sorted_, kept = np.empty((most, planes)), np.empty(most), np.empty(most, np.bool_)
@@ -168,24 +185,24 @@ def _blend(views: Any, gain: Any, floor: float, least: int, out: Any) -> None:
         count = min(total[point], most)
         if count < max(least, 1):
             continue
+        while weights[point, count - 1] < little * weights[point, 0]:
+            count -= 1
         kept[:] = True
         for view in range(count):
             for plane in range(planes):
                 balanced[view, plane] = values[point, view, plane] * gain[images[point, view], plane]
         if count >= 3:
             _vote(balanced, count, floor, kept, sorted_)
-        _mean(balanced, weights[point], kept, count, out[point])
+        _mean(balanced, weights, kept, count, point, out)
 
 
 @njit(cache=True, nogil=True)
-def _mean(balanced: Any, weights: Any, kept: Any, count: int, out: Any) -> None:
-    """Weighted mean of the views that are kept."""
-    weight = 0.0
-    out[:] = 0.0
-    for view in range(count):
-        if kept[view]:
-            weight += weights[view]
-            for plane in range(len(out)):
-                out[plane] += weights[view] * balanced[view, plane]
-    for plane in range(len(out)):
-        out[plane] /= weight
+def _mean(balanced: Any, weights: Any, kept: Any, count: int, point: int, out: Any) -> None:
+    """Weighted mean of the views of a point that are kept."""
+    for plane in range(out.shape[1]):
+        weight, total = 0.0, 0.0
+        for view in range(count):
+            if kept[view]:
+                weight += weights[point, view]
+                total += weights[point, view] * balanced[view, plane]
+        out[point, plane] = total / weight

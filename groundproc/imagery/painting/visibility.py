@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.imagery.lenses import projected, unproject_all
+from groundproc.imagery.lenses import placed, unproject_all
 
 Array = npt.NDArray[np.float64]
 
@@ -222,45 +222,22 @@ def _turning(eye: Eye) -> Array:
     return np.ascontiguousarray(found.reshape(_NODES, _NODES, 2, 3))
 
 
-@njit(cache=True, nogil=True)
-def _project(eye: Any, xyz: Any, spans: Any, number: Any, pixel: Any, ranges: Any) -> int:
-    count = 0
-    ray, place = np.empty(3), np.empty(2)
-    mat, at = eye.mat_cam_local, eye.place_m
-    right, down = eye.size_px[0] - 0.5, eye.size_px[1] - 0.5
-    late = mat @ eye.row_m
-    rolls, middle = (eye.row_m != 0.0).any(), 0.5 * (eye.size_px[1] - 1)
-    for span in range(len(spans)):
-        for i in range(spans[span, 0], spans[span, 1]):
-            x, y, z = xyz[i, 0] - at[0], xyz[i, 1] - at[1], xyz[i, 2] - at[2]
-            for row in range(3):
-                ray[row] = mat[row, 0] * x + mat[row, 1] * y + mat[row, 2] * z
-            reached = projected(eye.kind, eye.lens, ray, place)
-            if rolls and reached:
-                reached = _rolled(eye, ray, late, middle, place)
-            if reached and -0.5 <= place[0] <= right and -0.5 <= place[1] <= down:
-                number[count] = i
-                pixel[count, 0], pixel[count, 1] = place[0], place[1]
-                ranges[count] = np.sqrt(x * x + y * y + z * z)
-                count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
-def _rolled(eye: Any, ray: Any, late: Any, middle: float, place: Any) -> bool:
-    """The pixel of a ray of the middle row as the camera has it that moves on until the pixel's own row."""
-    own, reached = np.empty(3), True
-    for _ in range(ROLLS):
-        rows = min(max(place[1] - middle, -middle - 1.0), middle + 1.0)
-        for axis in range(3):
-            own[axis] = ray[axis] - rows * late[axis]
-        reached = projected(eye.kind, eye.lens, own, place)
-        if not reached:
-            break
-    return reached
-
-
 # What a point is and where it is goes from one kernel to the next as tuples of numbers: arrays would be counted, at every call.
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turned(mat: Any, way: Any) -> tuple[float, float, float]:
+    return (
+        mat[0, 0] * way[0] + mat[0, 1] * way[1] + mat[0, 2] * way[2],
+        mat[1, 0] * way[0] + mat[1, 1] * way[1] + mat[1, 2] * way[2],
+        mat[2, 0] * way[0] + mat[2, 1] * way[1] + mat[2, 2] * way[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _step(turning: Any, row: int, column: int, which: int) -> tuple[float, float, float]:
+    """How the ray turns to the right (0) or down (1) at a node."""
+    return turning[row, column, which, 0], turning[row, column, which, 1], turning[row, column, which, 2]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -299,6 +276,41 @@ def _facing(normal: Any, way: Any, above: float, right: Any, below: Any) -> tupl
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _project(eye: Any, xyz: Any, spans: Any, number: Any, pixel: Any, ranges: Any) -> int:
+    count = 0
+    mat, lens, kind, place = eye.mat_cam_local, eye.lens, eye.kind, eye.place_m
+    right, down = eye.size_px[0] - 0.5, eye.size_px[1] - 0.5
+    late = _turned(mat, (eye.row_m[0], eye.row_m[1], eye.row_m[2]))
+    rolls, middle = _dot(late, late) > 0.0, 0.5 * (eye.size_px[1] - 1)
+    for span in range(len(spans)):
+        for i in range(spans[span, 0], spans[span, 1]):
+            way = _way(xyz, i, place)
+            ray = _turned(mat, way)
+            reached, u, v = placed(kind, lens, ray[0], ray[1], ray[2])
+            if rolls and reached:
+                reached, u, v = _rolled((kind, lens), ray, late, middle, v)
+            if reached and -0.5 <= u <= right and -0.5 <= v <= down:
+                number[count] = i
+                pixel[count, 0], pixel[count, 1] = u, v
+                ranges[count] = np.sqrt(_dot(way, way))
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _rolled(camera: Any, ray: Any, late: Any, middle: float, v: float) -> tuple[bool, float, float]:
+    """The pixel of a ray of the middle row as the camera has it that moves on until the pixel's own row; `v`: without moving."""
+    kind, lens = camera
+    reached, u = True, 0.0
+    for _ in range(ROLLS):
+        rows = min(max(v - middle, -middle - 1.0), middle + 1.0)
+        reached, u, v = placed(kind, lens, ray[0] - rows * late[0], ray[1] - rows * late[1], ray[2] - rows * late[2])
+        if not reached:
+            break
+    return reached, u, v
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths: Any) -> None:
     near, facing, loose = depths
     xyz, spacing, normals, above = surface.xyz_m, surface.spacing_m, surface.normal, surface.above_m
@@ -310,7 +322,7 @@ def _splat(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depth
         reach = min(_REACH * spacing[point], WIDEST_PX / (focal * inverse))
         radius = reach * focal * inverse
         row, column = _node(u, v, shape)
-        right, below = _triple(turning[row, column], 0), _triple(turning[row, column], 1)
+        right, below = _step(turning, row, column, 0), _step(turning, row, column, 1)
         way = _way(xyz, point, place)
         plane = _facing(_triple(normals, point), way, np.float64(above[point]), right, below)
         if plane[4] > 0.3:
@@ -360,7 +372,32 @@ def _disc(plane: Any, ways: Any, at: Any, terms: Any, near: Any, facing: Any) ->
     u, v, radius = at
     inverse, across = terms
     w0, wu, wv = plane[0] / across, plane[1] / across, plane[2] / across
+    row, column = int(v), int(u)
+    du, dv = column + 0.5 - u, row + 0.5 - v
+    w = w0 + du * wu + dv * wv
+    # no more than its own pixel, and that is taken by something nearer: as most are where points are dense
+    if radius <= 0.5 and inverse <= near[row, column] and not w > near[row, column]:
+        return
     c, cu, cv, cuu, cuv, cvv = _rim(ways, inverse, (w0, wu, wv), plane[3] * plane[3])
+    inside = c + du * (cu + du * cuu) + dv * (cv + du * cuv + dv * cvv) <= 0.0
+    if inside and w > near[row, column]:
+        near[row, column] = w
+        facing[row, column] = abs(w * across)
+    elif inverse > near[row, column] and not (
+        inside and w > 0.0
+    ):  # else it has been laid, farther than the point or not
+        near[row, column] = inverse
+        facing[row, column] = abs(w * across)
+    if radius > 0.5:
+        _spread((w0, wu, wv, across), (c, cu, cv, cuu, cuv, cvv), at, near, facing)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _spread(plane: Any, rim: Any, at: Any, near: Any, facing: Any) -> None:
+    """The pixels that lie inside of a disc."""
+    w0, wu, wv, across = plane
+    c, cu, cv, cuu, cuv, cvv = rim
+    u, v, radius = at
     top, bottom = _sides(v, radius, near.shape[0])
     left, beyond = _sides(u, radius, near.shape[1])
     for row in range(top, bottom):
@@ -372,14 +409,6 @@ def _disc(plane: Any, ways: Any, at: Any, terms: Any, near: Any, facing: Any) ->
             if (w > near[row, column]) & (start + du * (slope + du * cuu) <= 0.0):
                 near[row, column] = w
                 facing[row, column] = abs(w * across)
-    row, column = int(v), int(u)
-    if inverse > near[row, column]:
-        du, dv = column + 0.5 - u, row + 0.5 - v
-        w = w0 + du * wu + dv * wv
-        inside = c + du * (cu + du * cuu) + dv * (cv + du * cuv + dv * cvv) <= 0.0
-        if not (inside and w > 0.0):  # else it has been laid, farther than the point or not
-            near[row, column] = inverse
-            facing[row, column] = abs(w * across)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -416,7 +445,7 @@ def _sees(seen: Any, surface: Any, place: Any, scales: Any, turning: Any, depths
         point, distance = number[i], np.float64(ranges[i])
         u, v = (pixel[i, 0] + 0.5) * scale, (pixel[i, 1] + 0.5) * scale
         row, column = _node(u, v, shape)
-        right, below = _triple(turning[row, column], 0), _triple(turning[row, column], 1)
+        right, below = _step(turning, row, column, 0), _step(turning, row, column, 1)
         plane = _facing(_triple(normals, point), _way(xyz, point, place), np.float64(above[point]), right, below)
         row, column = int(v), int(u)
         pixel_ = 1.0 / np.float64(nearest[row, column]), np.float64(facing[row, column])

@@ -19,6 +19,7 @@ from groundproc.imagery.painting.paint import depths_of
 from groundproc.imagery.painting.scene import Scene
 from groundproc.imagery.painting.views import MOST, NOBODY, Views, sampled
 from groundproc.imagery.painting.visibility import ROLLS, Depths
+from groundproc.imagery.radiance import TEMPERATURE
 
 Array = npt.NDArray[np.float64]
 Raster = npt.NDArray[np.float32]
@@ -285,6 +286,8 @@ def _factors(
     out = {number: np.ones(len(bands)) for number in range(len(sources))}
     looked = [_looked_up(source, points) for source in sources]
     for at, band in enumerate(bands):
+        if band == TEMPERATURE:
+            continue  # measured: warmer pictures are of warmer things
         having = [number for number, source in enumerate(sources) if band in source.bands]
         views = Views(
             np.full((len(points), MOST), NOBODY), np.zeros((len(points), MOST), np.float32),
