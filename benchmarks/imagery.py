@@ -1,8 +1,10 @@
 """Images: the adjustment against the reports of an independent one, and on rendered photographs with known truth; colours and indices.
 
-The blocks of the reports lie in the folder that SWATH_RECORDINGS names. The last line is one JSON object.
+The blocks of the reports lie in the folder that SWATH_RECORDINGS names. `--parts` measures some only, each within a few minutes of two
+cores. The last line is one JSON object.
 """
 
+import argparse
 import json
 import os
 import sys
@@ -10,7 +12,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import laspy
 import numpy as np
@@ -73,7 +75,6 @@ def cloud(path: Path) -> None:
 
 def photographed(folder: Path) -> dict[str, Any]:
     """A block of 20 rendered photographs, 60 and 40 % over each other, GNSS to 2/2/3 cm, no control: with lidar and without."""
-    folder.mkdir()
     camera = imageblock.true_camera().camera
     truth = imageblock.true_camera(camera=replace(camera, focal_px=1290.0), line_delay_s=2e-5)
     flown = imageblock.fly(truth, strips=4, per_strip=5, seed=11, spacing_m=(11.5, 22.5), height=30.0)
@@ -115,15 +116,33 @@ def photographed(folder: Path) -> dict[str, Any]:
     }
 
 
+def painting(folder: Path) -> dict[str, Any]:
+    """Colours and indices."""
+    return imagery_painting.figures(folder)
+
+
+PARTS: Final = {"reports": reports, "photographed": photographed, "painting": painting}
+
+
 def main() -> None:
-    """Measure."""
+    """Measure all parts, or those named."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="NAME", help=", ".join(PARTS))
+    parts = parser.parse_args().parts
     figures: dict[str, Any] = {}
+    others = os.getloadavg()[0] - 1.0 if hasattr(os, "getloadavg") else 0.0
+    if others > 0.5:
+        print(
+            f"note: some {others:.0f} other programs were running meanwhile: seconds are longer and rates lower than on a quiet machine"
+        )
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        if "SWATH_RECORDINGS" in os.environ:
-            figures |= reports(folder)
-        figures |= photographed(folder / "block")
-        figures |= imagery_painting.figures(folder / "painting")
+        for name in parts:
+            if name == "reports" and "SWATH_RECORDINGS" not in os.environ:
+                print("note: the blocks of the reports were not measured: SWATH_RECORDINGS is not set")
+                continue
+            folder = Path(place) / name
+            folder.mkdir()
+            figures |= PARTS[name](folder)
     print(json.dumps(figures))
 
 

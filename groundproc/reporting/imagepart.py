@@ -53,8 +53,11 @@ def _rows(told: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "Sigma0", f"{adjusted['sigma0']:.3f}"
     if adjusted["residual_rms_px"] is not None:
         yield "Residuals, RMS", f"{adjusted['residual_rms_px']:.2f} px"
-    share = colour["coloured"] / colour["points"]
-    yield "Points with a colour", f"{colour['coloured']:,} of {colour['points']:,} ({share:.1%})"
+    surface = colour["points"] - colour["no_surface"]
+    share = colour["coloured"] / max(surface, 1)
+    yield "Points with a colour", f"{colour['coloured']:,} of {surface:,} ({share:.1%})"
+    if colour["no_surface"]:
+        yield "Noise and what moved, without a colour", f"{colour['no_surface']:,}"
     score = ", ".join(f"{band} {value:.1f} %" for band, value in colour["held_out"].items())
     if score:
         yield "Held out: an image against what the others say, RMS of the full scale", score
