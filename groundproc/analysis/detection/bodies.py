@@ -21,6 +21,10 @@ _RANGE_M: Final = 3.0
 _SOLID: Final = 0.8
 """Share of a body's points that are on its plane."""
 _ON_M: Final = 0.2
+_STEPS_M: Final = tuple(np.arange(0.25, 1.3, 0.1))
+"""A bonnet or a bed is so much lower than the rest."""
+_STARTS: Final = (-0.15, 0.0, 0.15, 0.3)
+"""Where it begins, in lengths from the middle."""
 _GROUND_SOLID, _GROUND_THICKET = 0.03, 0.15
 _MOST: Final = 80
 """Points that count, of any number: neighbours are no independent witnesses."""
@@ -94,7 +98,7 @@ def body(target: Target, place_m: Array, xyz_m: Array, above_m: Array, top_m: fl
         plane = np.linalg.solve(tilt, design[on].T @ above_m[on])
         residual = above_m - design @ plane
         on = up & (np.abs(residual) < _ON_M)
-    score = _score(residual[up], int((inside & ~up).sum()), above_m[up])
+    score = _score(residual[up], u[up] / sides[0], int((inside & ~up).sum()), above_m[up])
     near = (above_m >= low_m) & (np.abs(residual) < _ON_M) & (np.hypot(u, v) < AROUND_M)
     near &= (np.abs(u) < sides[0] / 2 + 0.6) & (np.abs(v) < sides[1] / 2 + 0.6)
     length, width, angle, middle = _sides(xyz_m[near, :2])
@@ -103,16 +107,36 @@ def body(target: Target, place_m: Array, xyz_m: Array, above_m: Array, top_m: fl
     return Body(np.append(middle, z), length, width, height, angle, int(up.sum()), score)
 
 
-def _score(residual_m: Array, ground: int, above_m: Array) -> float:
-    """How much likelier heights and ground pulses are by a body than by a thicket, as a logarithm."""
+def _score(residual_m: Array, along: Array, ground: int, above_m: Array) -> float:
+    """How much likelier heights and ground pulses are by a body than by a thicket, as a logarithm.
+
+    Places along its length are told in lengths from the middle.
+    """
     sigma = max(float(above_m.std()), _THICKET_M)
-    flat = np.exp(-0.5 * (residual_m / _FLAT_M) ** 2) / (_FLAT_M * np.sqrt(2 * np.pi))
-    solid = np.log(_SOLID * flat + (1 - _SOLID) / _RANGE_M)
     spread = np.exp(-0.5 * ((above_m - above_m.mean()) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     thicket = np.log(0.8 * spread + 0.2 / _RANGE_M)
-    gain = float((solid - thicket).sum() + len(above_m) * np.log((1 - _GROUND_SOLID) / (1 - _GROUND_THICKET)))
+    gain = _solid(residual_m, along) - float(thicket.sum())
+    gain += len(above_m) * float(np.log((1 - _GROUND_SOLID) / (1 - _GROUND_THICKET)))
     gain += ground * float(np.log(_GROUND_SOLID / _GROUND_THICKET))
     return gain * min(1.0, _MOST / (len(above_m) + ground))
+
+
+def _solid(residual_m: Array, along: Array) -> float:
+    """Logarithm of the likelihood of heights by one flat top, or by one with a bonnet or a bed at one end.
+
+    The best of all ends and steps is as likely as it is less their number.
+    """
+    whole = _flat(residual_m)
+    lower = np.stack([_flat(residual_m + step) for step in _STEPS_M])
+    beyond = np.stack([side * along > start for side in (-1.0, 1.0) for start in _STARTS])
+    ends = (lower - whole) @ beyond.T
+    return float(whole.sum()) + max(0.0, float(ends.max()) - float(np.log(ends.size)))
+
+
+def _flat(residual_m: Array) -> Array:
+    """Logarithm of the density of points of a flat top, by their distance from it."""
+    flat = np.exp(-0.5 * (residual_m / _FLAT_M) ** 2) / (_FLAT_M * np.sqrt(2 * np.pi))
+    return np.asarray(np.log(_SOLID * flat + (1 - _SOLID) / _RANGE_M))
 
 
 def _sides(xy_m: Array) -> tuple[float, float, float, Array]:
