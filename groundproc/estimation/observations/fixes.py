@@ -24,6 +24,7 @@ from groundproc.estimation.observations.states import (
     POSITION,
     VELOCITY,
 )
+from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.stated import Positions
 from groundproc.estimation.odometry.tracker import SURE_HELD_M
@@ -60,9 +61,15 @@ SLID: Final = "position_drift"
 """Of the figures of a step: how far the path slides away from the fixes."""
 
 
+LIVELY_S: Final = 5
+"""Seconds over which changes of the fixes' errors are added up to be judged: multipath changes with the walls that one passes."""
+LIVELY_SIGMAS: Final = 3.0
+"""Changes larger than stated by so much more than chance allows are what the receiver does."""
+
+
 @dataclass(frozen=True, slots=True)
 class Left:
-    """Fixes that were left out because they contradict the lidar.
+    """What the lidar's way says of the fixes: some were left out because they contradict it.
 
     Attributes
     ----------
@@ -71,11 +78,14 @@ class Left:
         Largest distance from where the others have the path.
     doubt_m2 : ndarray, shape (3,)
         Variance of where the whole lies, as far as nobody can tell which of them are right.
+    strain : float
+        How many times more than stated horizontal errors change within seconds.
     """
 
     time_ns: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     farthest_m: float = 0.0
     doubt_m2: Array = field(default_factory=lambda: np.zeros(3))
+    strain: float = 1.0
 
     @classmethod
     def of_all(cls, parts: Sequence["Left"]) -> "Left":
@@ -86,7 +96,11 @@ class Left:
             np.unique(np.concatenate([part.time_ns for part in parts])),
             max(part.farthest_m for part in parts),
             np.max([part.doubt_m2 for part in parts], axis=0),
+            max(part.strain for part in parts),
         )
+
+
+NOTHING_LEFT: Final = Left()
 
 
 @dataclass(slots=True)
@@ -113,7 +127,7 @@ class Fixes(Observation):
     def begin(self, stretch: Stretch) -> "Fixes":
         """Without those that go where the lidar does not, while it holds the path."""
         given, left = without_walks(self.given, stretch)
-        return replace(self, given=given, left=left)
+        return replace(self, given=given, left=replace(left, strain=strain_of(given, stretch)))
 
     def keep(self, state: State, frame: Path) -> "Left":
         """What was left out."""
@@ -138,7 +152,7 @@ class Fixes(Observation):
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """The course of the positions, and their mean."""
-        return position_factors(self.given, state.path, unknowns, self.number, self.clock, self.left.doubt_m2)
+        return position_factors(self.given, state.path, unknowns, self.number, self.clock, self.left)
 
     def take(self, part: Mapping[str, Array], path: Path) -> None:
         """The mean error is told anew in each step."""
@@ -147,7 +161,7 @@ class Fixes(Observation):
 
     def figures(self, factors: Sequence[Factor]) -> dict[str, float]:
         """Whether the path slides away."""
-        return {f"{factor.name}_rms": factor.rms() for factor in factors} | {SLID: drift(factors)}
+        return {f"{factor.name}_rms": factor.rms() for factor in factors} | {SLID: drift(factors, self.left.strain)}
 
     def warnings(self, outcome: Outcome) -> list[str]:
         """A path that goes where the fixes do not."""
@@ -212,12 +226,56 @@ def without_walks(given: Positions, stretch: Stretch) -> tuple[Positions, Left]:
     return given.only(~np.isin(given.time_ns, left)), Left(left, farthest_m, doubt(time_s, off, kept))
 
 
-def drift(factors: Sequence[Factor]) -> float:
-    """Largest mean of ten whitened position residuals on end, in sigmas of such a mean: a path that slides away from the fixes."""
+def strain_of(given: Positions, stretch: Stretch) -> float:
+    """How many times more than stated the horizontal errors of the fixes change within seconds, 1 at least.
+
+    Beside walls a receiver errs by metres, otherwise every ten metres of the way. Where the lidar holds the path, what the fixes have
+    beyond its way is their error, but for a turn of the map and their age; its whitened changes, added up over some seconds, should be of
+    size one.
+    """
+    inside = within(given.time_ns, stretch.path)
+    if stretch.unheld_m is None or inside.sum() < 2:
+        return 1.0
+    time_ns = given.time_ns[inside]
+    _, _, step, share = spots(time_ns, stretch.path)
+    quat, position = poses(stretch.path, step, share)
+    place = position + frames.mat_from_quat(quat) @ given.lever_m
+    group, middle = seconds(time_ns)
+    off = means(given.position_m[inside] - place, group)[:, :2]
+    way = means(place, group)[:, :2]
+    time_s = (time_ns[middle] - time_ns[0]) * 1e-9
+    # what a turn of the map, and an age of the fixes, make of the way
+    bent = np.stack([np.stack([-way[:, 1], way[:, 0]], axis=1), np.gradient(way, axis=0)], axis=2)
+    keep = np.exp(-np.diff(time_s)[:, None] / given.tau_s[:2])
+    sigma = means(given.sigma_m[inside], group)[1:, :2]
+    size = np.sqrt(sigma**2 * (1.0 - keep**2) + given.white_m**2 * (1.0 + keep**2))
+    held = np.concatenate([[0], np.cumsum(stretch.unheld_m > TELLS_M)])
+    edge = np.clip(np.round((time_ns[middle] - stretch.path.start_ns) * 1e-9 / H).astype(np.int64), 0, len(held) - 1)
+    good = (np.diff(held[edge]) == 0) & (np.diff(time_s) < 1.5)
+    changes = (off[1:] - keep * off[:-1]) / size
+    bent = (bent[1:] - keep[:, :, None] * bent[:-1]) / size[:, :, None]
+    if good.sum() < 2 * LIVELY_S:
+        return 1.0
+    explained, *_ = np.linalg.lstsq(bent[good].reshape(-1, 2), changes[good].ravel(), rcond=None)
+    left = np.where(good[:, None], changes - bent @ explained, 0.0)
+    whole = np.convolve(good, np.ones(LIVELY_S), mode="valid") == LIVELY_S
+    sums = np.stack([np.convolve(axis, np.ones(LIVELY_S), mode="valid")[whole] for axis in left.T]) / np.sqrt(LIVELY_S)
+    if not sums.size:
+        return 1.0
+    power = float(np.square(sums).mean())
+    chance = LIVELY_SIGMAS * float(np.sqrt(2.0 * LIVELY_S / (2.0 * good.sum())))
+    return float(np.sqrt(power)) if power > 1.0 + chance else 1.0
+
+
+def drift(factors: Sequence[Factor], strain: float = 1.0) -> float:
+    """Largest mean of ten whitened position residuals on end, in sigmas of such a mean: a path that slides away from the fixes.
+
+    In the sigmas that are stated, whatever `strain` the rows were given.
+    """
     largest = 0.0
     for factor in factors:
         if factor.name == "position" and len(factor.residual) > 3 * DRIFT_S:
-            whitened = (factor.residual / factor.sigma).reshape(-1, 3)
+            whitened = (factor.residual / factor.sigma).reshape(-1, 3) * [strain, strain, 1.0]
             sums = np.cumsum(whitened, axis=0)
             largest = max(largest, float(np.abs(sums[DRIFT_S:] - sums[:-DRIFT_S]).max()) / np.sqrt(DRIFT_S))
     return largest
@@ -230,7 +288,7 @@ def fixes_name(number: int) -> str:
 
 def position_factors(
     given: Positions, path: Path, unknowns: Unknowns, number: int = 0, clock: Clock | None = None,
-    doubt_m2: Array | float = 0.0,
+    left: Left = NOTHING_LEFT,
 ) -> list[Factor]:  # fmt: skip
     """Positions in means of a second: their course, and their mean; none where the path covers fewer than two.
 
@@ -260,12 +318,13 @@ def position_factors(
         clock.add(builder, row, means(velocities(path, step, given.lever_m), group))
     time_s = (time_ns[middle] - time_ns[0]) * 1e-9
     course = whitened("position", residual, builder.matrix(), time_s, sigma, given.tau_s, given.white_m, Errors.ANCHOR)
+    course = replace(course, sigma=course.sigma * np.tile([left.strain, left.strain, 1.0], count))
     # a receiver that jumps, or is led astray by a wall, goes where no vehicle does: its steps lose weight
     course = replace(course, sigma=course.sigma / np.sqrt(huber(np.abs(course.residual) / course.sigma, STEP_SIGMAS)))
     if fixes_name(number) not in unknowns.names:
         return [course]
     mean = _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)
-    return [course, replace(mean, sigma=np.sqrt(mean.sigma**2 + doubt_m2))]
+    return [course, replace(mean, sigma=np.sqrt(mean.sigma**2 + left.doubt_m2))]
 
 
 SAMPLES: Final = 8

@@ -147,7 +147,7 @@ def rows_of(
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
     rotation, xyz = rotation[kept], clusters.xyz_m[kept]
     del world, knot, weights, voxel, order, good, keep, seen, poses, variance, leaves  # a hundred bytes a cluster
-    keep_told(rows, Poses(rotation, xyz), flat, voxel_m)
+    keep_told(rows, Poses(rotation, xyz), flat, voxel_m, means)
     if clusters.laser is not None:
         in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
         rows.with_lasers(clusters.laser[kept], xyz, in_sensor)

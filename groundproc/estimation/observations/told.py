@@ -12,7 +12,8 @@ import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import uniform_filter1d
 
-from groundproc.estimation.odometry.matching import GROUND, INFLATION, RELIEF, TELLS_M, observable
+from groundproc.estimation.odometry.matching import FACING_VOXELS, GROUND, INFLATION, RELIEF, TELLS_M, observable
+from groundproc.numerics.facing import mean_normals
 from groundproc.numerics.planerows import PlaneRows, RowArrays
 
 Array = npt.NDArray[np.float64]
@@ -41,7 +42,7 @@ class Poses(NamedTuple):
     xyz_m: Singles
 
 
-def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float) -> None:
+def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m: Array) -> None:
     """Leave in the rows of each interval what they really tell.
 
     Judged on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it, and each change
@@ -57,6 +58,8 @@ def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float) -> None:
     flat : int
         So many rows are of planes, those after them of what fills its voxel.
     voxel_m : float
+    place_m : ndarray, shape (voxels, 3)
+        Where each voxel is.
     """
     normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
     _sum_ground(rows.knot[:flat], rows.jacobian, rows.weight, normals)
@@ -64,12 +67,16 @@ def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float) -> None:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     relief = np.zeros_like(rows.jacobian[:flat])
     _level(rows.knot, rows.jacobian, poses, normals, level, relief)
-    base, more = np.zeros((2, rows.intervals, 6, 6))
+    base, more, judged = np.zeros((3, rows.intervals, 6, 6))
     _blocks(rows.knot, level, rows.weight, base)
     _blocks(rows.knot[:flat], relief, rows.weight, more)
-    size = np.trace(base[:, 3:, 3:], axis1=1, axis2=2)
+    facing = level.copy()
+    normal, unsure = _facing(rows, flat, place_m, voxel_m)
+    _face(rows.arrays, poses, flat, (normal, unsure), facing, judged)
+    _blocks(rows.knot, facing, rows.weight, judged)
+    size = np.trace(judged[:, 3:, 3:], axis1=1, axis2=2)
     least = INFLATION * TELLS_M**-2 / np.maximum(size, 1e-12)
-    known = np.array([observable(*each) if each[0].any() else np.eye(6) for each in zip(base, least, strict=True)])
+    known = np.array([observable(*each) if each[0].any() else np.eye(6) for each in zip(judged, least, strict=True)])
     affected = np.trace(known, axis1=1, axis2=2) < TOLD
     share = shares_of_relief(base, more)
     share[affected] = 0.0
@@ -80,6 +87,53 @@ def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float) -> None:
         weaker[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(base[blind, :3, :3])[:, 2])
         rows.weight *= weaker[rows.knot]
         rows.replane(voxel_m)
+
+
+def _facing(rows: PlaneRows, flat: int, place_m: Array, voxel_m: float) -> tuple[Array, Array]:
+    """Normals of the voxels as they face as a whole with those near by, shape (voxels, 3), and covariances; zero where none stands."""
+    normal = np.asarray(rows.jacobian[rows.first[:-1], 3:], np.float64)
+    stands = (rows.first[:-1] < flat) & (np.abs(normal[:, 2]) <= GROUND)
+    tilt = 0.5 * INFLATION * (rows.inverse[:, 3] + rows.inverse[:, 5]) / voxel_m**2
+    normal[~stands] = 0.0
+    covariance = np.zeros((len(normal), 3, 3))
+    normal[stands], covariance[stands] = mean_normals(
+        place_m[stands], normal[stands], tilt[stands], FACING_VOXELS * voxel_m
+    )
+    return normal, covariance
+
+
+@njit(cache=True, nogil=True)
+def _face(
+    rows: RowArrays, poses: Poses, flat: int, facing: tuple[Array, Array], out: Singles, judged: Array
+) -> None:  # fmt: skip
+    """Rows of planes that stand by rotation about the map's axes and by position, with the normals that they are judged by.
+
+    What these are unsure of adds to the information by chance, and is taken off `judged`, shape (intervals, 6, 6).
+    """
+    rotation, xyz = poses.rotation, poses.xyz_m
+    normals, covariances = facing
+    by, some = np.zeros((3, 6)), np.empty(6)
+    for c in range(3):
+        by[c, 3 + c] = 1.0
+    for v in range(len(rows.first) - 1):
+        nx, ny, nz = normals[v]
+        if nx == 0.0 and ny == 0.0 and nz == 0.0:
+            continue
+        for i in range(rows.first[v], min(rows.first[v + 1], flat)):
+            m, k = rotation[i], rows.knot[i]
+            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
+            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
+            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
+            by[0, 1], by[0, 2], by[1, 0], by[1, 2], by[2, 0], by[2, 1] = z, -y, -z, x, y, -x
+            for c in range(6):
+                out[i, c] = by[0, c] * nx + by[1, c] * ny + by[2, c] * nz
+            for c in range(3):
+                s = covariances[v, c]
+                for a in range(6):
+                    some[a] = s[0] * by[0, a] + s[1] * by[1, a] + s[2] * by[2, a]
+                for a in range(6):
+                    for b in range(6):
+                        judged[k, a, b] -= rows.weight[i] * by[c, a] * some[b]
 
 
 def shares_of_relief(base: Array, relief: Array) -> Array:

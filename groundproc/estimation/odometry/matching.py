@@ -20,6 +20,7 @@ from groundproc.estimation.odometry.voxels import (
     MapArrays,
     find,
 )
+from groundproc.numerics.facing import mean_normals
 from groundproc.numerics.rotations import mat_of_quat, quat_difference, unit_vector
 from groundproc.numerics.voxelhash import voxel_key
 
@@ -51,6 +52,8 @@ FILLED_RETURNS: Final = 4
 TELLS_M: Final = 0.1
 """Sigma of a direction in one slice from which on nothing is taken of it. Over bare ground, a few planes that are none seem to hold the
 path by some decimetres a slice, and brake it by a metre a second; trees at 30 m hold it to 1 cm."""
+FACING_VOXELS: Final = 8.0
+"""Edge of the cubes, in voxels, within which planes that face nearly one way are judged by their mean normal: sixty of one wall."""
 ROUNDS: Final = 4
 
 
@@ -110,11 +113,15 @@ class Sums(NamedTuple):
         Of all that is not ground.
     level, ground : Normal
         Of the ground by its mean normal, and by the normals of its voxels.
+    facing : Normal
+        Of all that is not ground, planes by the mean normals of those that face the same way near by, less what is left of chance in
+        these: what is judged by.
     """
 
     rest: Normal
     level: Normal
     ground: Normal
+    facing: Normal
 
 
 @njit(cache=True, nogil=True)
@@ -255,8 +262,9 @@ def _accumulate(
     mat, position = pose
     row, residual, weight = found
     j, off = np.empty(6), np.empty(3)
+    mean, unsure = _facing(planes, row, ground)
     squares = 0.0
-    for each in (sums.rest, sums.level, sums.ground):
+    for each in (sums.rest, sums.level, sums.ground, sums.facing):
         each.information[:, :], each.pull[:] = 0.0, 0.0
     for n in range(len(body)):
         if row[n] < 0:
@@ -268,22 +276,65 @@ def _accumulate(
                     mat[c, 0] * body[n, 0] + mat[c, 1] * body[n, 1] + mat[c, 2] * body[n, 2] + position[c] - v[MEAN + c]
                 )
             _add_filled(v, mat, body[n], off, clusters.returns[n], planes.voxel_m, sums.rest)
+            _add_filled(v, mat, body[n], off, clusters.returns[n], planes.voxel_m, sums.facing)
             continue
         squares += e * e
         _row(mat, body[n], v[NORMAL], v[NORMAL + 1], v[NORMAL + 2], j)
         lean = v[NORMAL] * ground[0] + v[NORMAL + 1] * ground[1] + v[NORMAL + 2] * ground[2]
         if abs(lean) <= GROUND:
             _add(j, weight[n], e, sums.rest)
+            _row(mat, body[n], mean[n, 0], mean[n, 1], mean[n, 2], j)
+            _add(j, weight[n], e, sums.facing)
+            _take_off(mat, body[n], unsure[n], weight[n], sums.facing)
             continue
         _add(j, weight[n], e, sums.ground)
         side = 1.0 if lean > 0.0 else -1.0
         _row(mat, body[n], side * ground[0], side * ground[1], side * ground[2], j)
         _add(j, weight[n], e, sums.level)
-    for each in (sums.rest, sums.level, sums.ground):
+    for each in (sums.rest, sums.level, sums.ground, sums.facing):
         for a in range(6):
             for b in range(a):
                 each.information[b, a] = each.information[a, b]
     return squares
+
+
+@njit(cache=True, nogil=True)
+def _facing(planes: MapArrays, row: Ints, ground: Array) -> tuple[Array, Array]:
+    """Mean normals of the planes that each cluster's plane faces one way with, shape (n, 3), and their covariances, shape (n, 3, 3).
+
+    Zero where a cluster is on the ground, or on no plane.
+    """
+    voxels, count = planes.voxels, 0
+    at, tilt = np.empty(len(row), np.int64), np.empty(len(row))
+    place, normal = np.empty((len(row), 3)), np.empty((len(row), 3))
+    for n in range(len(row)):
+        if row[n] < 0 or voxels[row[n], FLATNESS] < 0.0:
+            continue
+        v = voxels[row[n]]
+        if abs(v[NORMAL] * ground[0] + v[NORMAL + 1] * ground[1] + v[NORMAL + 2] * ground[2]) > GROUND:
+            continue
+        at[count], tilt[count] = n, v[TILT]
+        place[count], normal[count] = v[MEAN : MEAN + 3], v[NORMAL : NORMAL + 3]
+        count += 1
+    found = mean_normals(place[:count], normal[:count], tilt[:count], FACING_VOXELS * planes.voxel_m)
+    mean, covariance = np.zeros((len(row), 3)), np.zeros((len(row), 3, 3))
+    for i in range(count):
+        mean[at[i]], covariance[at[i]] = found[0][i], found[1][i]
+    return mean, covariance
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _take_off(mat: Array, body: Array, covariance: Array, weight: float, normal: Normal) -> None:
+    """Take off the lower half of the information what an error of the normal adds to it by chance: weight J C J^T."""
+    by, some = np.empty((3, 6)), np.empty(6)
+    for c in range(3):
+        _row(mat, body, 1.0 if c == 0 else 0.0, 1.0 if c == 1 else 0.0, 1.0 if c == 2 else 0.0, by[c])
+    for c in range(3):
+        for a in range(6):
+            some[a] = covariance[c, 0] * by[0, a] + covariance[c, 1] * by[1, a] + covariance[c, 2] * by[2, a]
+        for a in range(6):
+            for b in range(a + 1):
+                normal.information[a, b] -= weight * by[c, a] * some[b]
 
 
 @njit(cache=True, nogil=True)
@@ -312,7 +363,8 @@ def told(sums: Sums) -> Normal:
     normals are right enough to help.
     """
     base, pull = sums.rest.information + sums.level.information, sums.rest.pull + sums.level.pull
-    known = observable(base, TELLS_M**-2 / max(base[3, 3] + base[4, 4] + base[5, 5], 1e-12))
+    judged = sums.facing.information + sums.level.information
+    known = observable(judged, TELLS_M**-2 / max(judged[3, 3] + judged[4, 4] + judged[5, 5], 1e-12))
     if np.trace(known) < 5.5:
         across = np.ascontiguousarray(known.T)
         return Normal(across @ base @ np.ascontiguousarray(known), across @ pull)
@@ -342,7 +394,7 @@ def update(
     total = np.zeros(STATES)  # correction so far: the prior pulls back to where it began
     mat, turn = np.empty((3, 3)), np.empty(3)
     before = quat.copy()
-    sums = Sums(_nothing(), _nothing(), _nothing())
+    sums = Sums(_nothing(), _nothing(), _nothing(), _nothing())
     factor, inner = np.zeros((6, 6)), np.eye(6)
     clusters = _Clusters(body, counts)
     found = _Matches(np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body)))
@@ -376,5 +428,5 @@ def update(
             break
     gain = to_pose @ factor
     left = covariance - gain @ (inner @ gain.T)
-    unheld = weakest(sums.rest.information + sums.level.information)
+    unheld = weakest(sums.facing.information + sums.level.information)
     return matched, np.sqrt(squares / max(matched, 1)), unheld, 0.5 * (left + left.T)

@@ -18,7 +18,7 @@ from groundproc.estimation.odometry.matching import update
 from groundproc.estimation.odometry.motion import LIDAR, MotionGrid
 from groundproc.estimation.odometry.rotor import Line
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
-from groundproc.estimation.odometry.state import POSITION, ROTATION, STATES, STEP_S, State, apply, propagate
+from groundproc.estimation.odometry.state import POSITION, ROTATION, STATES, STEP_S, VELOCITY, State, apply, propagate
 from groundproc.estimation.odometry.voxels import COUNT, MEAN, SCATTER, PlaneMap
 from groundproc.estimation.odometry.within import Seen, Within
 from groundproc.numerics.rotations import mat_of_quat, quat_difference
@@ -179,14 +179,22 @@ class Odometry:
 
     def position_fix(self, position_m: Array, sigma_m: Array) -> None:
         """Take a position of the sensor, shape (3,), with its sigmas."""
+        self._fix(POSITION, position_m - self.state.position_m, sigma_m)
+
+    def velocity_fix(self, velocity_m_s: Array, sigma_m_s: Array) -> None:
+        """Take a velocity of the sensor, shape (3,), with its sigmas."""
+        self._fix(VELOCITY, velocity_m_s - self.state.velocity_m_s, sigma_m_s)
+
+    def _fix(self, part: slice, off: Array, sigma: Array) -> None:
+        """Take an observation of three states that is off by so much, shape (3,)."""
         s = self.state
         observed = np.zeros((3, STATES))
-        observed[:, POSITION] = np.eye(3)
-        innovation = observed @ s.covariance @ observed.T + np.diag(sigma_m**2)
+        observed[:, part] = np.eye(3)
+        innovation = observed @ s.covariance @ observed.T + np.diag(sigma**2)
         gain = np.linalg.solve(innovation, observed @ s.covariance).T
-        self._correct(gain @ (position_m - s.position_m))
+        self._correct(gain @ off)
         keep = np.eye(STATES) - gain @ observed
-        s.covariance = keep @ s.covariance @ keep.T + gain @ np.diag(sigma_m**2) @ gain.T
+        s.covariance = keep @ s.covariance @ keep.T + gain @ np.diag(sigma**2) @ gain.T
 
     def attitude_fix(self, quat: Array, sigma_rad: Array) -> None:
         """Take an attitude of the sensor, shape (4,), with its sigmas about the map's axes."""

@@ -36,6 +36,8 @@ CHECKED: Final = 10
 """Slices over which the way is compared with a guide's: a second."""
 ASTRAY_M: Final = 1.5
 """What it may differ by; a smoother's velocity is right to 0.1 to 0.3 m/s."""
+GUIDED_M_S: Final = 1.0
+"""Sigma of a guide's velocity as it is taken slice by slice: right to 0.3 m/s, and its error lasts for a second at least."""
 SURE_HELD_M: Final = 0.03
 """A way that slices tell better than this is the lidar's to tell."""
 HELD_SHARE: Final = 0.98
@@ -108,6 +110,8 @@ class Tracker:
         if len(piece.xyz_m):
             self._follow_range(odometry, piece)
         step = odometry.step(piece)
+        if step.unheld_m > TELLS_M:
+            self._be_guided(odometry)
         self._take_stated(odometry)
         self._note(odometry, step)
         if self._rejoining.after(odometry, track) is not None:
@@ -255,6 +259,19 @@ class Tracker:
             self.track.astray += astray
             self._rejoining.forget()
             self._set_out(state, odometry.number)
+
+    def _be_guided(self, odometry: Odometry) -> None:
+        """Take the guide's velocity where a slice leaves a direction open: what the lidar tells of the others is far firmer."""
+        if self._guide is None:
+            return
+        now_ns = self._now_ns(odometry)
+        poses, covered = self._guide.where_covered(np.array([now_ns - SLICE_NS, now_ns, now_ns + SLICE_NS]))
+        if not covered.all():
+            return
+        mats = frames.mat_from_quat(poses.quat_local_ins_wxyz)
+        places = poses.position_m + mats @ self._lever
+        turned = frames.mat_from_quat(odometry.state.quat[None])[0] @ (mats[1] @ self._mat).T
+        odometry.velocity_fix(turned @ (places[2] - places[0]) / (2e-9 * SLICE_NS), np.full(3, GUIDED_M_S))
 
     def _is_astray(self, odometry: Odometry) -> bool:
         """Whether the last second's way is not the guide's, though the lidar tells it, and not well: what is no surface holds it."""

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from groundproc.estimation.observations.fixes import Left, without_walks
+from groundproc.estimation.observations.fixes import Left, strain_of, without_walks
 from groundproc.estimation.observations.observation import Stretch
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
@@ -98,3 +98,36 @@ def test_what_windows_left_out_is_told_once() -> None:
     assert both.farthest_m == 9.0
     assert both.doubt_m2.tolist() == [1.0, 3.0, 2.0]
     assert not len(Left.of_all([]).time_ns)
+
+
+def stretch(unheld_m: Array | None = HELD) -> Stretch:
+    return Stretch(path(), "lidar", np.zeros(3), True, unheld_m)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_errors_that_change_as_stated_are_not_strained(seed: int) -> None:
+    assert strain_of(fixes(np.zeros((SECONDS, 3)), seed), stretch()) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_multipath_that_changes_within_seconds_is_seen_as_large_as_it_is(seed: int) -> None:
+    """3 m on each axis that last two seconds, whatever the map is turned by and however well the other errors are stated."""
+    rng, keep = np.random.default_rng(100 + seed), np.exp(-0.5)
+    walk = np.zeros((SECONDS, 3))
+    for second in range(1, SECONDS):
+        walk[second, :2] = keep * walk[second - 1, :2] + 3.0 * np.sqrt(1.0 - keep**2) * rng.standard_normal(2)
+    lag = np.exp(-np.arange(6) / 2.0)
+    # variance of five changes on end of such errors, and of those that are stated, over what is stated of them
+    ours = 3.0**2 * 2.0 * (1.0 - lag[5])
+    stated = 5.0 * (3.0**2 * -np.expm1(-2.0 / 60.0) + 2.0 * 0.1**2)
+    expected = np.sqrt((ours + stated) / stated)
+    assert strain_of(fixes(walk, seed), stretch()) == pytest.approx(expected, rel=0.35)
+
+
+def test_a_lidar_that_does_not_hold_the_path_says_nothing_of_the_fixes() -> None:
+    walk = np.zeros((SECONDS, 3))
+    walk[::4, 0] = 8.0
+    given = fixes(walk)
+    assert strain_of(given, stretch()) > 1.5
+    assert strain_of(given, stretch(np.full(10 * SECONDS, 0.3))) == 1.0
+    assert strain_of(given, stretch(None)) == 1.0

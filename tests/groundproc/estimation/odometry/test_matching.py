@@ -134,7 +134,7 @@ def nothing() -> Normal:
 def test_a_relief_that_tells_little_counts_in_full() -> None:
     rng = np.random.default_rng(4)
     rest, ground = random_normal(rng, 30.0), random_normal(rng, 1.0)
-    found = told(Sums(rest, nothing(), ground))
+    found = told(Sums(rest, nothing(), ground, rest))
     np.testing.assert_allclose(found.information, rest.information + ground.information, rtol=1e-6)
     np.testing.assert_allclose(found.pull, rest.pull + ground.pull, rtol=1e-6)
 
@@ -143,7 +143,7 @@ def test_a_relief_tells_no_more_than_all_else_in_any_direction() -> None:
     """And its own mean says the same as before: less information, and the pull to match."""
     rng = np.random.default_rng(5)
     rest, relief = random_normal(rng, 30.0), random_normal(rng, 1000.0)
-    found = told(Sums(rest, nothing(), relief))
+    found = told(Sums(rest, nothing(), relief, rest))
     more = found.information - rest.information
     shares = np.linalg.eigvals(np.linalg.solve(rest.information, more)).real
     np.testing.assert_allclose(shares, RELIEF, rtol=1e-3)
@@ -165,7 +165,7 @@ def test_the_relief_alone_does_not_hold_the_place() -> None:
             j = np.concatenate([np.cross(point, n), n])
             total += 300.0 * np.outer(j, j)
     zero = np.zeros(6)
-    found = told(Sums(nothing(), Normal(level, zero), Normal(ground, zero))).information
+    found = told(Sums(nothing(), Normal(level, zero), Normal(ground, zero), nothing())).information
     sigma = 1.0 / np.sqrt(np.maximum(np.diag(found), 1e-12))
     assert sigma[[0, 1, 5]].max() < 0.01
     assert sigma[[2, 3, 4]].min() > 1.0
@@ -191,3 +191,47 @@ def test_a_strip_that_leans_by_no_more_than_its_width_allows_is_no_wall() -> Non
         spread[name] = float(np.sqrt(after[3, 3]))
     assert spread["narrow"] > 0.09
     assert spread["sure"] < 0.03
+
+
+def street(rng: np.random.Generator, cars: bool) -> Array:
+    """Returns of 15 mm between two plain walls along x, 20 m apart, and of a street; `cars`: with ends of parked cars."""
+    count = 30_000
+    walls = np.column_stack(
+        [rng.uniform(-25.0, 25.0, count), rng.choice([-10.0, 10.0], count), rng.uniform(0.1, 7.9, count)]
+    )
+    ground = np.column_stack([rng.uniform(-12.0, 12.0, (count, 2)), np.zeros(count)])
+    parts = [walls, ground]
+    if cars:
+        for at in np.arange(-20.3, 21.0, 8.0):
+            end = np.column_stack([np.full(300, at), rng.uniform(7.05, 8.7, 300), rng.uniform(0.3, 1.3, 300)])
+            parts += [end, end + np.array([4.3, 0.0, 0.0]), end * np.array([1.0, -1.0, 1.0])]
+    clean = np.concatenate(parts)
+    return np.asarray(clean + rng.normal(scale=0.015, size=clean.shape))
+
+
+@pytest.mark.parametrize("cars", [False, True])
+def test_the_way_along_plain_walls_is_told_by_cars_and_not_by_normals_that_lean(cars: bool) -> None:
+    """Each normal leans by half a degree and more, by the thousand: they would seem to hold the way along to centimetres."""
+    rng = np.random.default_rng(8)
+    planes = map_of(street(rng, cars), 0.5)
+    seen = street(rng, cars)
+    seen = seen[rng.permutation(len(seen))[:4000]] - [0.0, 0.0, 2.1]
+    begun = state(np.array([0.0, 0.0, 2.1]), np.zeros(3), 0.1)
+    count = np.ones(len(seen), np.int32)
+    *_, unheld, after = update(
+        planes.arrays, seen, count, begun.arrays, begun.covariance.copy(), np.array([0.0, 0.0, 1e3])
+    )
+    along, across, up = np.sqrt(np.diag(after)[3:6])
+    assert max(across, up) < 0.03
+    assert unheld[1] < 0.03
+    if cars:
+        assert unheld[0] < 0.06
+        assert along < 0.05
+    else:
+        assert unheld[0] > 0.15
+        assert along > 0.095
+    # what the normals by themselves claim
+    stands = planes.voxels[: planes.count, FLATNESS] >= 0.0
+    leans = planes.voxels[: planes.count][stands]
+    leans = leans[np.abs(leans[:, NORMAL + 1]) > 0.9]
+    assert np.square(leans[:, NORMAL]).mean() > np.deg2rad(0.5) ** 2
