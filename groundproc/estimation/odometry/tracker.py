@@ -110,7 +110,7 @@ class Tracker:
         if len(piece.xyz_m):
             self._follow_range(odometry, piece)
         step = odometry.step(piece)
-        if step.unheld_m > TELLS_M:
+        if step.next_unheld_m <= TELLS_M < step.unheld_m:
             self._be_guided(odometry)
         self._take_stated(odometry)
         self._note(odometry, step)
@@ -261,7 +261,7 @@ class Tracker:
             self._set_out(state, odometry.number)
 
     def _be_guided(self, odometry: Odometry) -> None:
-        """Take the guide's velocity where a slice leaves a direction open: what the lidar tells of the others is far firmer."""
+        """Take the guide's velocity where a slice leaves one direction open: what the lidar tells of the others is far firmer."""
         if self._guide is None:
             return
         now_ns = self._now_ns(odometry)

@@ -12,6 +12,7 @@ from flightlog.constants import STANDARD_GRAVITY_M_S2
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.history import KEPT, History
 from groundproc.estimation.odometry.motion import Motion
+from groundproc.estimation.odometry.odometry import Odometry, Step
 from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.stated import Attitudes, Fix, Positions, Recorded
 from groundproc.estimation.odometry.tracker import CHECKED, FEWEST, Tracker
@@ -172,6 +173,27 @@ def test_what_seems_to_hold_the_path_and_leads_it_elsewhere_is_noticed_in_a_seco
         tracker.feed(Slice(number, np.empty(0, np.int64), np.empty((0, 3), np.float32)))
     assert tracker.track is not None
     assert (tracker.track.astray, tracker.track.restarts) == (astray, astray)
+
+
+@pytest.mark.parametrize(("told_m", "share"), [((0.2, 0.01), 0.85), ((5.0, 5.0), 0.0), ((0.01, 0.01), 0.0)])
+def test_one_open_direction_goes_with_the_guide(
+    told_m: tuple[float, float], share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the start nothing else knows it; where nothing at all is told, or all, the guide has no say."""
+    real, east_m_s = Odometry.step, 1.5
+
+    def step(self: Odometry, piece: Slice) -> Step:
+        return replace(real(self, piece), unheld_m=told_m[0], next_unheld_m=told_m[1])
+
+    monkeypatch.setattr(Odometry, "step", step)
+    motion, rough = straight()
+    east = np.stack([east_m_s * (rough.time_ns - START_NS) * 1e-9, *np.zeros((2, len(rough)))], axis=1)
+    guide = replace(rough, position_m=rough.position_m + east)
+    tracker = Tracker(motion, rough, np.eye(3), np.zeros(3), np.zeros(3), Late(0), keep=False, guide=guide)
+    for number in range(20):
+        tracker.feed(Slice(number, np.empty(0, np.int64), np.empty((0, 3), np.float32)))
+    assert tracker.track is not None
+    assert tracker.track.velocity_m_s[-1][0] == pytest.approx(share * east_m_s, abs=0.15 * east_m_s)
 
 
 class Astray(Late):
