@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.linalg import cho_factor, solve_triangular
 
 from groundproc.imagery.bundle.block import Block, PosePriors
-from groundproc.imagery.bundle.observed import add_dense, bare_rows, what_is_new, whitening
+from groundproc.imagery.bundle.observed import add_dense, bare_rows, pose_residuals, what_is_new, whitening
 from groundproc.imagery.bundle.screen import Adjusted
 
 Array = npt.NDArray[np.float64]
@@ -32,6 +32,8 @@ SIZES: Final = (1.0, 1.7, 3.0, 5.0, 9.0, 15.0, 25.0)
 MOST_STATIONS: Final = 80
 """The first so many tell."""
 MOST_KEPT: Final = 0.9999
+DEPARTS: Final = 3.0
+"""Sigmas, RMS, beyond which a trajectory departs from its block by more than errors that last explain."""
 BY_CHANCE: Final = 3.0
 """Logarithm of likelihood that a time constant and a size have to gain."""
 
@@ -72,6 +74,24 @@ def applied(block: Block, lasting: Lasting) -> Block:
         keep = _kept((time_ns - time_ns.min()) * 1e-9, before, lasting)
         priors = replace(priors, before=before, keep=keep)
     return replace(block, priors=priors)
+
+
+def departures(block: Block, stated: PosePriors) -> dict[str, float]:
+    """RMS of what a trajectory departs from an adjusted block by, as a whole apart: of place and of turn, in sigmas.
+
+    Parameters
+    ----------
+    block : Block
+    stated : PosePriors
+        As the trajectory states them.
+
+    How large errors are that last for long is hardly told by how they change, and the size of such a process is not this.
+    """
+    residual, found = pose_residuals(block, stated), {}
+    for name, part in (("place", slice(0, 3)), ("turn", slice(3, 6))):
+        lower = np.linalg.cholesky(stated.covariance[:, part, part])
+        found[name] = float(np.sqrt(np.square(np.linalg.solve(lower, residual[:, part, None])).mean()))
+    return found
 
 
 def told_by(adjusted: Adjusted, stated: PosePriors) -> Lasting:

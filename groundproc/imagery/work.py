@@ -133,7 +133,10 @@ def _adjusted(
     if not few.all():
         block = completed(adjusted.solved.block, made.block, matched, adjusted.sigma_px)
         adjusted = adjust(block if surface is None else held_to(block, surface), known, matched, told, begun=True)
-    return adjusted, {"held_out": held_out, "lasting": asdict(session.lasting)} | results.common_of(adjusted)
+    block = adjusted.solved.block
+    departs = lasting.departures(block, flown.resampled(session.trajectory, block).priors)
+    told_of_it = {"held_out": held_out, "lasting": asdict(session.lasting), "trajectory_departs_sigmas": departs}
+    return adjusted, told_of_it | results.common_of(adjusted)
 
 
 def _on_surface(
@@ -246,10 +249,11 @@ def doubts_of(told: dict[str, Any], session: Session, measured: Measurements) ->
         doubts.append(
             f"images with fewer than {_FEW_POINTS} points in common with others, placed by the trajectory alone: {names_listed(few)}"
         )
-    if max(session.lasting.place, session.lasting.turn) >= max(lasting.SIZES):
+    departs = max(told.get("trajectory_departs_sigmas", {}).values(), default=0.0)
+    if max(session.lasting.place, session.lasting.turn) >= max(lasting.SIZES) and departs > lasting.DEPARTS:
         doubts.append(
-            f"the trajectory departs from the block by {max(lasting.SIZES) ** 0.5:.0f} times its stated sigmas or more: is the camera "
-            "model, the clock or the trajectory the right one?"
+            f"the trajectory departs from the block by {departs:.1f} times its stated sigmas, expected about one: is the camera model, the "
+            "clock or the trajectory the right one?"
         )
     gross = told["counts"]["left_out"]["gross"]
     if gross:

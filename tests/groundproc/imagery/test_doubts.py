@@ -48,5 +48,12 @@ def test_a_wrong_camera_model_shows_in_residuals_or_in_the_trajectory(session: S
     (sentence,) = doubts_of(told(rms_px=7.5), session, MEASURED)
     assert "7.5 px" in sentence
     session.lasting = lasting.Lasting(place=max(lasting.SIZES))
-    (sentence,) = doubts_of(told(), session, MEASURED)
-    assert "5 times its stated sigmas or more" in sentence
+    departing = told() | {"trajectory_departs_sigmas": {"place": 6.2, "turn": 0.8}}
+    (sentence,) = doubts_of(departing, session, MEASURED)
+    assert "departs from the block by 6.2 times its stated sigmas" in sentence
+
+
+def test_errors_that_last_for_long_are_no_departure_however_large_their_process(session: Session) -> None:
+    session.lasting = lasting.Lasting(place=max(lasting.SIZES), place_s=lasting.LONGEST_S)
+    near = told() | {"trajectory_departs_sigmas": {"place": 1.3, "turn": 0.6}}
+    assert doubts_of(near, session, MEASURED) == []

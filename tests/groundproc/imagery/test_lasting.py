@@ -11,7 +11,7 @@ from groundproc.imagery.assembly import unknown_poses
 from groundproc.imagery.bundle.block import POSE, Block, ImagePoints, PosePriors
 from groundproc.imagery.bundle.observed import bare_rows, pose_rows, whitening
 from groundproc.imagery.bundle.unknowns import lay_out
-from groundproc.imagery.lasting import Lasting, Told, applied, likeliest
+from groundproc.imagery.lasting import Lasting, Told, applied, departures, likeliest
 from groundproc.imagery.rig import Rig
 from groundproc.imagery.rotations import cross_matrix, mat_of_vector
 from groundproc.imagery.thinning import thinned
@@ -87,6 +87,14 @@ def test_errors_larger_than_stated_are_found_to_be() -> None:
     told = told_of(block)
     assert told.place == pytest.approx(9.0, rel=0.3)
     assert told.turn == pytest.approx(9.0, rel=0.3)
+
+
+def test_a_departure_is_counted_in_stated_sigmas() -> None:
+    block = block_with(3.0 * errors_lasting(1, 0.0))
+    found = departures(block, block.priors)
+    # of 144 values each
+    assert found["place"] == pytest.approx(3.0, rel=0.2)
+    assert found["turn"] == pytest.approx(3.0, rel=0.2)
 
 
 def test_rows_of_errors_that_last_are_those_of_their_full_covariance() -> None:
