@@ -15,7 +15,8 @@ from groundproc.imagery.rotations import STRAIGHT_DOWN
 
 Array = npt.NDArray[np.float64]
 
-CAMERA = Camera(640, 480, 400.0, (320.5, 238.0), "radtan", (-0.05, 0.01))
+CAMERA = Camera(320, 480, 400.0, (160.5, 238.0), "radtan", (-0.05, 0.01))
+"""Narrow across the flight: pictures overlap along it, and features are what an adjustment takes its time for."""
 CELL_M = 0.04
 HALF_M = 60.0
 
@@ -53,14 +54,17 @@ def photograph(poses: npt.NDArray[Any], row: int, ground: Array) -> npt.NDArray[
     return np.rint(255.0 * seen).astype(np.uint8).reshape(CAMERA.height_px, CAMERA.width_px, 3)
 
 
-def write_photographs(folder: Path, poses: npt.NDArray[Any], every_s: float, seed: int) -> list[str]:
-    """JPEG files of the flight where it is high enough, times.csv and rig.yaml beside them; gives their names."""
+def write_photographs(
+    folder: Path, poses: npt.NDArray[Any], span_s: tuple[float, float], every_s: float, seed: int
+) -> list[str]:
+    """JPEG files of a part of the flight, times.csv and rig.yaml beside them; gives their names."""
     folder.mkdir(parents=True)
     ground = pattern(seed)
-    step = int(every_s * 1e9 / (poses["utc_ns"][1] - poses["utc_ns"][0]))
+    rate_hz = 1e9 / (poses["utc_ns"][1] - poses["utc_ns"][0])
+    first, end, step = (int(seconds * rate_hz) for seconds in (*span_s, every_s))
     lines = ["image,utc_ns"]
     names = []
-    for row in range(step, len(poses) - step, step):
+    for row in range(first, end, step):
         names.append(f"img{row:05d}.jpg")
         Image.fromarray(photograph(poses, row, ground)).save(folder / names[-1], quality=95)
         lines.append(f"{names[-1]},{poses['utc_ns'][row]}")
