@@ -127,7 +127,7 @@ def _between_strips(echoes: dict[str, Any], value: Array) -> Figures:
     count = np.bincount(number, minlength=2 * len(keys)).reshape(-1, 2)
     both = (count >= 100).all(axis=1)
     raw, made = (
-        np.log(np.divide(*(np.bincount(number, v[field], 2 * len(keys)).reshape(-1, 2) / count)[both].T))
+        np.log(np.divide(*(np.bincount(number, v[field], 2 * len(keys)).reshape(-1, 2)[both] / count[both]).T))
         for v in (echoes["intensity"], value)
     )
     before, after = float(np.median(np.abs(raw))), float(np.median(np.abs(made)))
