@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flightlog.logfile import LogReader, LogWriter
+from flightlog.logfile import LogReader
+from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 from groundproc.trajectory.estimate import read_estimate
 
