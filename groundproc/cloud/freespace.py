@@ -170,26 +170,22 @@ def _key(i: Any, j: Any, k: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _look(rays: _Rays, maps: _Maps, evidence: Evidence, part: int) -> None:
-    unit = np.empty(3)
     for n in range(len(rays.xyz_m)):
         if maps.part[rays.voxel[n]] == part:
             _note_hit(evidence, rays.voxel[n], rays.time_ms[n])
         if n % EVERY:
             continue
-        square = 0.0
-        for a in range(3):
-            unit[a] = rays.xyz_m[n, a] - rays.origin_m[n, a]
-            square += unit[a] * unit[a]
-        length = np.sqrt(square)
+        ox, oy, oz = rays.origin_m[n, 0], rays.origin_m[n, 1], rays.origin_m[n, 2]
+        ux, uy, uz = rays.xyz_m[n, 0] - ox, rays.xyz_m[n, 1] - oy, rays.xyz_m[n, 2] - oz
+        length = np.sqrt(ux * ux + uy * uy + uz * uz)
         if length < BEGIN_M + BEYOND_M:
             continue
-        for a in range(3):
-            unit[a] /= length
         slant = np.float64(rays.incidence_deg[n])
         cosine = 0.2 if np.isnan(slant) else max(np.cos(np.deg2rad(slant)), 0.02)
         end = length - max(BEYOND_M, SKIMS_M / cosine)
         if end > BEGIN_M:
-            _through_cubes(rays.origin_m[n], unit, end, rays.time_ms[n], maps, evidence, part)
+            ray = ox, oy, oz, ux / length, uy / length, uz / length
+            _through_cubes(ray, end, rays.time_ms[n], maps, evidence, part)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -202,21 +198,25 @@ def _next_wall(place: float, way: float, edge_m: float) -> Any:
     return (wall - place) / way, edge_m / abs(way)
 
 
-@njit(cache=True, nogil=True)
-def _through_cubes(origin: Any, unit: Any, end: float, now_ms: int, maps: _Maps, evidence: Evidence, part: int) -> None:
-    """Go along a ray from cube to cube (Amanatides and Woo 1987), and through the voxels of those that hold something."""
-    x, y, z = (origin[0] + BEGIN_M * unit[0], origin[1] + BEGIN_M * unit[1], origin[2] + BEGIN_M * unit[2])
-    next_x, step_x = _next_wall(x, unit[0], maps.cube_m)
-    next_y, step_y = _next_wall(y, unit[1], maps.cube_m)
-    next_z, step_z = _next_wall(z, unit[2], maps.cube_m)
+@njit(cache=True, nogil=True, inline="always")
+def _through_cubes(ray: Any, end: float, now_ms: int, maps: _Maps, evidence: Evidence, part: int) -> None:
+    """Go along a ray from cube to cube (Amanatides and Woo 1987), and through the voxels of those that hold something.
+
+    A ray is six numbers: of a row of an array numba counts references. And what takes many arrays is inlined: numba hands over each.
+    """
+    ox, oy, oz, ux, uy, uz = ray
+    x, y, z = ox + BEGIN_M * ux, oy + BEGIN_M * uy, oz + BEGIN_M * uz
+    next_x, step_x = _next_wall(x, ux, maps.cube_m)
+    next_y, step_y = _next_wall(y, uy, maps.cube_m)
+    next_z, step_z = _next_wall(z, uz, maps.cube_m)
     at, far = 0.0, end - BEGIN_M
     while at < far:
         out = min(next_x, next_y, next_z, far)
         middle = 0.5 * (at + out)
-        key = voxel_key(x + middle * unit[0], y + middle * unit[1], z + middle * unit[2], 1.0 / maps.cube_m)
+        key = voxel_key(x + middle * ux, y + middle * uy, z + middle * uz, 1.0 / maps.cube_m)
         w = find(key, maps.cube_table, maps.cube_keys)
         if w >= 0 and maps.cube_part[w] == part:
-            _through_voxels(origin, unit, (BEGIN_M + at, BEGIN_M + out), now_ms, maps, evidence, w)
+            _through_voxels(ray, (BEGIN_M + at, BEGIN_M + out), now_ms, maps, evidence, w)
         at = out
         if next_x <= out:
             next_x += step_x
@@ -226,32 +226,31 @@ def _through_cubes(origin: Any, unit: Any, end: float, now_ms: int, maps: _Maps,
             next_z += step_z
 
 
-@njit(cache=True, nogil=True)
-def _through_voxels(
-    origin: Any, unit: Any, between: Any, now_ms: int, maps: _Maps, evidence: Evidence, cube: int
-) -> None:
+@njit(cache=True, nogil=True, inline="always")
+def _through_voxels(ray: Any, between: Any, now_ms: int, maps: _Maps, evidence: Evidence, cube: int) -> None:
     """Go along a ray from voxel to voxel of one cube."""
     begin, end = between
+    ox, oy, oz, ux, uy, uz = ray
     key = maps.cube_keys[cube]
     cube_i, cube_j, cube_k = signed(key >> 42), signed(key >> 21), signed(key)
-    per_m, full = 1.0 / maps.edge_m, maps.full[cube]
-    x, y, z = (origin[0] + begin * unit[0], origin[1] + begin * unit[1], origin[2] + begin * unit[2])
-    next_x, step_x = _next_wall(x, unit[0], maps.edge_m)
-    next_y, step_y = _next_wall(y, unit[1], maps.edge_m)
-    next_z, step_z = _next_wall(z, unit[2], maps.edge_m)
+    per_m = 1.0 / maps.edge_m
+    x, y, z = ox + begin * ux, oy + begin * uy, oz + begin * uz
+    next_x, step_x = _next_wall(x, ux, maps.edge_m)
+    next_y, step_y = _next_wall(y, uy, maps.edge_m)
+    next_z, step_z = _next_wall(z, uz, maps.edge_m)
     at, far = 0.0, end - begin
     while at < far:
         out = min(next_x, next_y, next_z, far)
         middle = 0.5 * (at + out)
-        i = np.int64(np.floor((x + middle * unit[0]) * per_m))
-        j = np.int64(np.floor((y + middle * unit[1]) * per_m))
-        k = np.int64(np.floor((z + middle * unit[2]) * per_m))
+        i = np.int64(np.floor((x + middle * ux) * per_m))
+        j = np.int64(np.floor((y + middle * uy) * per_m))
+        k = np.int64(np.floor((z + middle * uz) * per_m))
         bit = _bit(i, j, k)
         # rounding may put a piece of no length into a neighbour, which another thread may have
         inside = i >> 3 == cube_i and j >> 3 == cube_j and k >> 3 == cube_k
-        if inside and full[bit >> 6] >> np.uint64(bit & 63) & np.uint64(1):
+        if inside and maps.full[cube, bit >> 6] >> np.uint64(bit & 63) & np.uint64(1):
             v = find(_key(i, j, k), maps.table, maps.voxels.key)
-            if now_ms - evidence.last_ms[v] >= LOOK_MS and _contradicts(origin, unit, maps, v):
+            if now_ms - evidence.last_ms[v] >= LOOK_MS and _contradicts(ray, maps.voxels, maps.edge_m, v):
                 _note(maps.voxels, evidence, v, now_ms)
         at = out
         if next_x <= out:
@@ -285,29 +284,30 @@ def _note(voxels: Voxels, evidence: Evidence, v: int, now_ms: int) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _contradicts(origin: Any, unit: Any, maps: _Maps, v: int) -> Any:
+def _contradicts(ray: Any, voxels: Voxels, edge_m: float, v: Any) -> Any:
     """Whether a beam that passes a voxel says that what was hit there is not there."""
-    s, seen = maps.voxels.sums[v], maps.voxels.seen[v]
-    alike = unit[0] * seen[0] + unit[1] * seen[1] + unit[2] * seen[2]
-    length = np.sqrt(seen[0] * seen[0] + seen[1] * seen[1] + seen[2] * seen[2])
+    ox, oy, oz, ux, uy, uz = ray
+    seen_x, seen_y, seen_z = voxels.seen[v, 0], voxels.seen[v, 1], voxels.seen[v, 2]
+    alike = ux * seen_x + uy * seen_y + uz * seen_z
+    length = np.sqrt(seen_x * seen_x + seen_y * seen_y + seen_z * seen_z)
     if alike < _ALIKE * length:
         return False
-    n = s[0]
-    mx, my, mz = s[1] / n, s[2] / n, s[3] / n
-    cx, cy, cz = middle_of(maps.voxels.key[v], maps.edge_m)
-    wx, wy, wz = cx + mx - origin[0], cy + my - origin[1], cz + mz - origin[2]
-    along = wx * unit[0] + wy * unit[1] + wz * unit[2]
-    if along > _FARTHER * maps.voxels.farthest_m[v]:
+    s, n = voxels.sums, voxels.sums[v, 0]
+    mx, my, mz = s[v, 1] / n, s[v, 2] / n, s[v, 3] / n
+    cx, cy, cz = middle_of(voxels.key[v], edge_m)
+    wx, wy, wz = cx + mx - ox, cy + my - oy, cz + mz - oz
+    along = wx * ux + wy * uy + wz * uz
+    if along > _FARTHER * voxels.farthest_m[v]:
         return False
-    dx, dy, dz = wx - along * unit[0], wy - along * unit[1], wz - along * unit[2]
+    dx, dy, dz = wx - along * ux, wy - along * uy, wz - along * uz
     square = dx * dx + dy * dy + dz * dz
     if square < _NOISE_M2:
         return True
     inverse = 1.0 / np.sqrt(square)
     dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
     spread = (
-        dx * (dx * (s[4] / n - mx * mx) + 2.0 * dy * (s[5] / n - mx * my) + 2.0 * dz * (s[6] / n - mx * mz))
-        + dy * (dy * (s[7] / n - my * my) + 2.0 * dz * (s[8] / n - my * mz))
-        + dz * dz * (s[9] / n - mz * mz)
+        dx * (dx * (s[v, 4] / n - mx * mx) + 2.0 * dy * (s[v, 5] / n - mx * my) + 2.0 * dz * (s[v, 6] / n - mx * mz))
+        + dy * (dy * (s[v, 7] / n - my * my) + 2.0 * dz * (s[v, 8] / n - my * mz))
+        + dz * dz * (s[v, 9] / n - mz * mz)
     )
     return square < max(spread, 0.0) + _NOISE_M2
