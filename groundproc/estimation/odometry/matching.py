@@ -305,7 +305,7 @@ def _facing(planes: MapArrays, row: Ints, ground: Array) -> tuple[Array, Array]:
     Zero where a cluster is on the ground, or on no plane.
     """
     voxels, count = planes.voxels, 0
-    at, tilt = np.empty(len(row), np.int64), np.empty(len(row))
+    at = np.empty(len(row), np.int64)
     place, normal = np.empty((len(row), 3)), np.empty((len(row), 3))
     for n in range(len(row)):
         if row[n] < 0 or voxels[row[n], FLATNESS] < 0.0:
@@ -313,10 +313,10 @@ def _facing(planes: MapArrays, row: Ints, ground: Array) -> tuple[Array, Array]:
         v = voxels[row[n]]
         if abs(v[NORMAL] * ground[0] + v[NORMAL + 1] * ground[1] + v[NORMAL + 2] * ground[2]) > GROUND:
             continue
-        at[count], tilt[count] = n, v[TILT]
+        at[count] = n
         place[count], normal[count] = v[MEAN : MEAN + 3], v[NORMAL : NORMAL + 3]
         count += 1
-    found = mean_normals(place[:count], normal[:count], tilt[:count], FACING_VOXELS * planes.voxel_m)
+    found = mean_normals(place[:count], normal[:count], FACING_VOXELS * planes.voxel_m)
     mean, covariance = np.zeros((len(row), 3)), np.zeros((len(row), 3, 3))
     for i in range(count):
         mean[at[i]], covariance[at[i]] = found[0][i], found[1][i]

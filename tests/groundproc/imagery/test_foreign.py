@@ -213,8 +213,6 @@ def test_texture_of_a_wall_stays_on_the_wall(place: Path) -> None:
     high = np.max([np.where(_outside(xyz, *box[:2]) < near, box[2], 0.0) for box in BOXES], axis=0)
     wall = seen & (np.abs(away) < 0.5 * near) & (xyz[:, 2] > 0.5) & (xyz[:, 2] < high - 0.5)
     assert wall.sum() > 500
-    kk = alike(shown[wall] / factor, xyz[wall])
-    np.savez("/tmp/paint/wall.npz", xyz=xyz[wall], kk=kk, shown=shown[wall] / factor)
     assert (alike(shown[wall] / factor, xyz[wall]) != hamlet.WALL).mean() < 0.05
 
 
