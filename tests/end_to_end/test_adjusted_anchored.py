@@ -228,7 +228,8 @@ def test_control_points_lay_the_whole_on_the_earth(plain: Made, controlled: Made
     assert np.median(controlled.sigma_m) < 0.05
     # heading by points 20 m apart to some centimetres, tilt as gravity has it
     assert np.abs(np.rad2deg(controlled.turn_rad.mean(axis=0))).max() < 0.15
-    assert controlled.relative_m < 1.3 * plain.relative_m + 1e-3
+    # eleven points with 1 cm of noise bend the shape by no more than their mean is off
+    assert controlled.relative_m < plain.relative_m + 0.01 / np.sqrt(11)
 
 
 def test_a_blundered_point_is_named(controlled: Made) -> None:
