@@ -20,8 +20,7 @@ ONE_WAY: Final = 0.966
 MOST_WAYS: Final = 12
 """Ways that planes face within one cell; what comes after keeps its own normal."""
 FEWEST: Final = 3
-"""Planes that show by how they scatter what their normals are worth. Fewer are no wall that could seem to hold the way along it: to
-take off what their fits state left trunks and tufts of a meadow untold (0.10 deg of causal attitude in place of 0.03)."""
+"""Planes that show by how they scatter what their normals are worth; of fewer, what is stated of each goes."""
 
 
 class Ways(NamedTuple):
@@ -34,23 +33,26 @@ class Ways(NamedTuple):
         On one side.
     square : ndarray, shape (ways, 3, 3)
         Of outer products.
+    tilt : ndarray, shape (ways,)
+        Of stated variances.
     """
 
     planes: Array
     normal: Array
     square: Array
+    tilt: Array
 
 
 @njit(cache=True, nogil=True)
-def mean_normals(place_m: Array, normal: Array, cell_m: float) -> tuple[Array, Array]:
+def mean_normals(place_m: Array, normal: Array, tilt: Array, cell_m: float) -> tuple[Array, Array]:
     """Unit normals by which planes face as a whole, shape (n, 3), and the covariance of their errors, shape (n, 3, 3).
-
-    A plane with fewer than two beside it that face its way keeps its own normal, and a covariance of zero.
 
     Parameters
     ----------
     place_m, normal : ndarray, shape (n, 3)
         Where the planes are, and their unit normals of either side.
+    tilt : ndarray, shape (n,)
+        Stated variance of each normal's direction about one axis [rad^2].
     cell_m : float
         Edge of the cubes within which planes are near each other.
     """
@@ -60,22 +62,22 @@ def mean_normals(place_m: Array, normal: Array, cell_m: float) -> tuple[Array, A
         key[i] = voxel_key(place_m[i, 0], place_m[i, 1], place_m[i, 2], per_m)
     order = np.argsort(key)
     mean, covariance, way = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty(count, np.int64)
-    ways = Ways(np.empty(MOST_WAYS), np.empty((MOST_WAYS, 3)), np.empty((MOST_WAYS, 3, 3)))
+    ways = Ways(np.empty(MOST_WAYS), np.empty((MOST_WAYS, 3)), np.empty((MOST_WAYS, 3, 3)), np.empty(MOST_WAYS))
     first = 0
     while first < count:
         last = first + 1
         while last < count and key[order[last]] == key[order[first]]:
             last += 1
-        _sort_by_way(order[first:last], normal, way, ways)
+        _sort_by_way(order[first:last], normal, tilt, way, ways)
         for at in range(first, last):
             i = order[at]
-            _mean(normal[i], ways, way[i], mean[i], covariance[i])
+            _mean(normal[i], tilt[i], ways, way[i], mean[i], covariance[i])
         first = last
     return mean, covariance
 
 
 @njit(cache=True, nogil=True)
-def _sort_by_way(rows: Ints, normal: Array, way: Ints, ways: Ways) -> None:
+def _sort_by_way(rows: Ints, normal: Array, tilt: Array, way: Ints, ways: Ways) -> None:
     """Way that each of some planes faces, -1 where there are too many, and the sums of each way."""
     known = 0
     for i in rows:
@@ -87,13 +89,14 @@ def _sort_by_way(rows: Ints, normal: Array, way: Ints, ways: Ways) -> None:
                 best, nearest = k, lean
         if best < 0 and known < MOST_WAYS:
             best, known = known, known + 1
-            ways.planes[best], ways.normal[best], ways.square[best] = 0.0, 0.0, 0.0
+            ways.planes[best], ways.tilt[best], ways.normal[best], ways.square[best] = 0.0, 0.0, 0.0, 0.0
         way[i] = best
         if best < 0:
             continue
         t = ways.normal[best]
         side = 1.0 if n[0] * t[0] + n[1] * t[1] + n[2] * t[2] >= 0.0 else -1.0
         ways.planes[best] += 1.0
+        ways.tilt[best] += tilt[i]
         for a in range(3):
             t[a] += side * n[a]
             for b in range(3):
@@ -101,17 +104,22 @@ def _sort_by_way(rows: Ints, normal: Array, way: Ints, ways: Ways) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _mean(normal: Array, ways: Ways, way: int, mean: Array, covariance: Array) -> None:
+def _mean(normal: Array, tilt: float, ways: Ways, way: int, mean: Array, covariance: Array) -> None:
     """Mean normal of a plane's way, on the side of its own, and the covariance of its error."""
     mean[:] = normal
     count = 1.0 if way < 0 else ways.planes[way]
-    covariance[:, :] = 0.0
     if count < FEWEST:
-        return
+        each = tilt if way < 0 else ways.tilt[way] / count
+        for a in range(3):
+            for b in range(3):
+                covariance[a, b] = each / count * ((1.0 if a == b else 0.0) - normal[a] * normal[b])
+        if count == 1.0:
+            return
     t = ways.normal[way]
     size = np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
     side = 1.0 if normal[0] * t[0] + normal[1] * t[1] + normal[2] * t[2] >= 0.0 else -1.0
     for a in range(3):
         mean[a] = side * t[a] / size
         for b in range(3):
-            covariance[a, b] = (ways.square[way, a, b] - t[a] * t[b] / count) / (count * (count - 1.0))
+            if count >= FEWEST:
+                covariance[a, b] = (ways.square[way, a, b] - t[a] * t[b] / count) / (count * (count - 1.0))

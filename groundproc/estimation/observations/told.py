@@ -93,9 +93,12 @@ def _facing(rows: PlaneRows, flat: int, place_m: Array, voxel_m: float) -> tuple
     """Normals of the voxels as they face as a whole with those near by, shape (voxels, 3), and covariances; zero where none stands."""
     normal = np.asarray(rows.jacobian[rows.first[:-1], 3:], np.float64)
     stands = (rows.first[:-1] < flat) & (np.abs(normal[:, 2]) <= GROUND)
+    tilt = 0.5 * INFLATION * (rows.inverse[:, 3] + rows.inverse[:, 5]) / voxel_m**2
     normal[~stands] = 0.0
     covariance = np.zeros((len(normal), 3, 3))
-    normal[stands], covariance[stands] = mean_normals(place_m[stands], normal[stands], FACING_VOXELS * voxel_m)
+    normal[stands], covariance[stands] = mean_normals(
+        place_m[stands], normal[stands], tilt[stands], FACING_VOXELS * voxel_m
+    )
     return normal, covariance
 
 

@@ -316,7 +316,8 @@ def _facing(planes: MapArrays, row: Ints, ground: Array) -> tuple[Array, Array]:
         at[count] = n
         place[count], normal[count] = v[MEAN : MEAN + 3], v[NORMAL : NORMAL + 3]
         count += 1
-    found = mean_normals(place[:count], normal[:count], FACING_VOXELS * planes.voxel_m)
+    # fewer than three planes are no wall: with their stated tilts taken off, a meadow's trunks and tufts would tell nothing
+    found = mean_normals(place[:count], normal[:count], np.zeros(count), FACING_VOXELS * planes.voxel_m)
     mean, covariance = np.zeros((len(row), 3)), np.zeros((len(row), 3, 3))
     for i in range(count):
         mean[at[i]], covariance[at[i]] = found[0][i], found[1][i]
