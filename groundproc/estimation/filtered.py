@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from flightlog import frames
 from groundproc.estimation.inertial.readings import read
-from groundproc.estimation.inertial.solution import Solution, solve
+from groundproc.estimation.inertial.smoother import solve
+from groundproc.estimation.inertial.solution import Solution
 from groundproc.estimation.legs import leg_by_leg
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations.outside import shared

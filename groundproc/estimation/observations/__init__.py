@@ -6,7 +6,7 @@ A kind is a module with one or both of
     of_leg(heard: Heard) -> list[Measured]       for the smoother: what of this kind a leg has
 
 and one name in `KINDS`; observations of no file of the survey are handed to `adjusted_estimate`. The engines (adjustment.batch,
-adjustment.joining, inertial.solution) know lists of observations and nothing of their kinds. docs/methods/observations.md has an
+adjustment.joining, inertial.smoother) know lists of observations and nothing of their kinds. docs/methods/observations.md has an
 example.
 
 observation, measured   what an observation is to the adjustment and to the smoother

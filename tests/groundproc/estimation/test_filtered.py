@@ -21,7 +21,8 @@ from flightlog.mount import Mount
 from groundproc.accuracy.truth import read_truth
 from groundproc.estimation import direct, filtered, ins, methods, ownsolution
 from groundproc.estimation.inertial import readings
-from groundproc.estimation.inertial.solution import Solution, solve
+from groundproc.estimation.inertial.smoother import solve
+from groundproc.estimation.inertial.solution import Solution
 from groundproc.estimation.method import Given, gather
 from groundproc.estimation.observations.outside import shared
 from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, POSITION

@@ -13,7 +13,7 @@ from flightlog import frames
 from groundproc.estimation import observations
 from groundproc.estimation.adjustment.batch import Batch
 from groundproc.estimation.inertial.readings import Readings
-from groundproc.estimation.inertial.solution import solve
+from groundproc.estimation.inertial.smoother import solve
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.lidar import DEFLATION, Lidar
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Rows
