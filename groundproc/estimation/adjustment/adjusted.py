@@ -44,7 +44,7 @@ from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
 from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
 from groundproc.estimation.odometry.slices import Slice, slices
 from groundproc.estimation.odometry.stated import Recorded
-from groundproc.estimation.odometry.track import Track, grid_ns
+from groundproc.estimation.odometry.track import Track
 from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.flight.timeline import Leg
 from groundproc.sensors.lasers import ESTIMATE
@@ -86,6 +86,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     begun = begun_from(given, progress)
     start = begun.trajectory
     made: list[Run | CausalRun] = []
+    numbers: list[int] = []
     reasons: list[LogError] = []
     adjust = causal_run if given.survey.causal else functools.partial(whole_run, more=more)
     for number in sorted({leg.run for leg in given.placed}):
@@ -94,6 +95,8 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
             made.append(adjust(given, legs, number, start, progress))
         except LogError as error:
             reasons.append(error)
+        else:
+            numbers.append(number)
     if not made:
         raise reasons[0]
     # a run that is no better than its start tells nothing of the mount
@@ -103,10 +106,10 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     corrections = main.corrections()
     trajectory = joined(
         [
-            on_fixes(own_part(start, run), given)
+            on_fixes(own_part(start, given.placed, number), given)
             if run.is_worse()
             else run.bridged(run.trajectory(given, mount), start)
-            for run in made
+            for number, run in zip(numbers, made, strict=True)
         ]
     )
     return Estimate(
@@ -151,10 +154,12 @@ def _figures(run: "Run | CausalRun", given: Given, trajectory: Trajectory) -> Fi
     return seen | stated | outcome_figures(len(windows), run.track.restarts, run.is_worse(), last_round, estimated)
 
 
-def own_part(start: Trajectory, run: Run | CausalRun) -> Trajectory:
-    """The part of what was begun from that lies within a run."""
-    first = run.path.start_ns
-    return start.after(first - 1).before(int(grid_ns(run.path)[-1]))
+def own_part(start: Trajectory, placed: Sequence[Leg], number: int) -> Trajectory:
+    """The part of what was begun from that belongs to a run, whatever of it the lidar saw: from the end of the one before to its own."""
+    ends = {leg.run: int(leg.utc_from_lidar(np.array([leg.last_lidar_ns]))[0]) for leg in placed}
+    before, after = (max((each for each in ends if each < number), default=None), any(each > number for each in ends))
+    part = start if before is None else start.after(ends[before])
+    return part.before(ends[number]) if after else part
 
 
 def on_fixes(part: Trajectory, given: Given) -> Trajectory:

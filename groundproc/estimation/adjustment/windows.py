@@ -25,6 +25,7 @@ from groundproc.estimation.observations.rows import H, Unknowns
 from groundproc.estimation.observations.spin import spin_of
 from groundproc.estimation.observations.tie import Tie
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
+from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import LIDAR, Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
@@ -169,8 +170,11 @@ def adjust_window(
         path = _laid_on(path, tie)
     mat, lever = sources.mat_ins_lidar, sources.lever_m
     bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
-    unheld_m = None if track.restarts else np.array(track.unheld_m[first:last])
-    stretch = Stretch(path, motion.source, bias, not before and not more, unheld_m)
+    unheld_m = np.array(track.unheld_m[first:last])
+    stretch = Stretch(
+        path, motion.source, bias, not before and not more,
+        None if track.restarts else unheld_m, unheld_m <= TELLS_M,
+    )  # fmt: skip
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart))
     if motion.source == LIDAR:

@@ -11,12 +11,20 @@ from flightlog import frames
 from groundproc.estimation.observations import accelerometer, gyro
 from groundproc.estimation.observations.observation import Flown, Observation, State, Stretch
 from groundproc.estimation.observations.rows import Carrying, Factor, H, Unknowns, turned
-from groundproc.estimation.observations.unit import Unit, make_unit, place_on_grid, robust_sigma
+from groundproc.estimation.observations.unit import (
+    LEAST_FORCE,
+    LEAST_TURN,
+    Unit,
+    learnt_sigma,
+    make_unit,
+    place_on_grid,
+)
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.motion import ImuTrack
 from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 PRIORS: Final[dict[str, float]] = gyro.PRIORS | accelerometer.PRIORS | {"ins.delay": 0.01, "ins.drift": 60e-6}
 """What is known before, one sigma, of the globals by their names. The lidar's own unit has the lidar's clock; of the autopilot's are
@@ -29,9 +37,6 @@ UNITS: Final = {
     "accel_turn": "deg", "lever": "m", "delay": "s", "drift": "",
 }  # fmt: skip
 """Of the globals in reports."""
-LEAST_SHARE: Final = 0.4
-"""Of what a unit's samples scatter, vibration included: its noise is not taken to be below that, because where the lidar sees nothing the
-path is the unit's own and leaves no residuals."""
 
 
 @dataclass(slots=True)
@@ -49,6 +54,8 @@ class Inertial(Observation):
         Its gyro is the path's motion between knots.
     unit : Unit
         On the grid of the window; None before it begins.
+    held : ndarray of bool, shape (slices,), optional
+        Where the lidar holds the path.
     """
 
     name: str
@@ -56,11 +63,12 @@ class Inertial(Observation):
     lever_m: Array
     carries: bool
     unit: Unit | None = None
+    held: npt.NDArray[np.bool_] | None = None
 
     def begin(self, stretch: Stretch) -> "Inertial":
         """With the bias that the odometry found, where it went by this gyro."""
         bias = stretch.bias_rad_s if self.track.name == stretch.carried_by else np.zeros(3)
-        return replace(self, unit=make_unit(self.name, self.track, stretch.path, bias, self.lever_m))
+        return replace(self, unit=make_unit(self.name, self.track, stretch.path, bias, self.lever_m), held=stretch.held)
 
     def joined(self, values: Mapping[str, Array], kept: Any) -> None:
         """The windows' shapes and tilts are its own."""
@@ -79,23 +87,31 @@ class Inertial(Observation):
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """Turns of each slice and forces about each knot, with the noise that their residuals show once that is to be learnt.
 
-        Learnt again and again, the path would follow the units and their noise seem to vanish.
+        Learnt again and again, the path would follow the units and their noise seem to vanish. So it does where the lidar does not hold
+        the path: residuals of the rest alone tell it.
         """
         unit = self._begun()
         turn = gyro.turn_factor(unit, state.path, unknowns, state.spin_rad if self.carries else None)
+        interval = np.flatnonzero(unit.known.reshape(-1, STEPS).all(axis=1))
         if state.learn:
-            unit.sigma_turn_rad = robust_sigma(turn.residual.reshape(-1, 3), LEAST_SHARE * unit.sigma_turn_rad)
+            unit.sigma_turn_rad = self._learnt(turn, interval, interval, unit.sigma_turn_rad, LEAST_TURN)
             turn.sigma[:] = unit.sigma_turn_rad
         if self.carries:
-            interval = np.flatnonzero(unit.known.reshape(-1, STEPS).all(axis=1))
             turn.carrying = Carrying(interval, unit.sigma_turn_rad / float(np.sqrt(STEPS)))
         if not unit.force_known.any():
             return [turn]
         force = accelerometer.force_factor(unit, state.path, unknowns)
         if state.learn:
-            unit.sigma_force_m_s2 = robust_sigma(force.residual.reshape(-1, 3), LEAST_SHARE * unit.sigma_force_m_s2)
+            whole: npt.NDArray[np.bool_] = np.asarray(unit.force_known.reshape(-1, STEPS).all(axis=1))
+            before = np.flatnonzero(whole[:-1] & whole[1:])
+            unit.sigma_force_m_s2 = self._learnt(force, before, before + 1, unit.sigma_force_m_s2, LEAST_FORCE)
             force.sigma[:] = unit.sigma_force_m_s2
         return [turn, force]
+
+    def _learnt(self, factor: Factor, first: Ints, last: Ints, scatter: float, least: float) -> float:
+        """Noise of a factor's rows, three for each pair of slices `first` and `last` that they are of."""
+        held = np.ones(len(first), np.bool_) if self.held is None else self.held[first] & self.held[last]
+        return learnt_sigma(factor.residual.reshape(-1, 3), held, scatter, least)
 
     def take(self, part: Mapping[str, Array], path: Path) -> None:
         """A changed clock puts the samples elsewhere on the grid."""

@@ -64,6 +64,8 @@ class Stretch:
         The window is the whole flight: nothing is joined afterwards.
     unheld_m : ndarray, shape (slices,), optional
         How well each slice of the lidar holds the path, in the direction that it tells least of; none where it has led astray.
+    held : ndarray of bool, shape (slices,), optional
+        Slices in which the lidar tells every direction of the path, as far as it knows.
     """
 
     path: Path
@@ -71,6 +73,7 @@ class Stretch:
     bias_rad_s: Array
     whole: bool
     unheld_m: Array | None = None
+    held: npt.NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """An inertial unit on the grid of a path, with what has been found of its clock and its axes so far."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,14 @@ from groundproc.estimation.odometry.spline import Path
 from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
+
+LEAST_TURN: Final = 0.4
+"""Of what a gyro's samples scatter: its noise is not taken to be below that. Most of the scatter is vibration, which it follows."""
+LEAST_FORCE: Final = 1.0
+"""The same of an accelerometer: what shakes it is over between two samples, and as bad as noise. Residuals do not tell: the lidar knows a
+slice's place to a centimetre, which over a tenth of a second is some m/s^2, so the path follows the accelerometer and not the lidar."""
+FEWEST_HELD: Final = 30
+"""Slices that the lidar has to hold for residuals to tell a unit's noise: three seconds."""
 
 
 @dataclass(slots=True)
@@ -103,6 +112,21 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
     return unit
 
 
-def robust_sigma(residual: Array, least: float) -> float:
-    """Standard deviation from the median absolute deviation."""
-    return max(robust.sigma(residual, np.median(residual, axis=0)), least) if len(residual) else least
+def learnt_sigma(residual: Array, held: npt.NDArray[np.bool_], scatter: float, least: float) -> float:
+    """Noise of a unit by its residuals where the lidar holds the path, from the median absolute deviation.
+
+    Where nothing holds it the path is the unit's own and leaves no residuals.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, 3)
+    held : ndarray of bool, shape (n,)
+    scatter : float
+        What the unit's samples scatter, vibration included: what goes where too few residuals are held.
+    least : float
+        Share of it that the noise is not below.
+    """
+    rows = residual[held]
+    if len(rows) < FEWEST_HELD:
+        return scatter
+    return max(robust.sigma(rows, np.median(rows, axis=0)), least * scatter)
