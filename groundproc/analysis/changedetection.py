@@ -3,8 +3,8 @@
 A point is explained by the other epoch if it lies on a surface of it, by the roughness of that surface and the registration, or near to
 leaves of it, which sway. Points that are not, by themselves or together with those around them (`changewindows`), make clusters. A cluster
 counts if chance has not put it together, by the number of sets of points that could have come out as unlikely. It is a claim if the other
-epoch had to have seen several points of it, by its own density there or by its own beams that went through, and did look there: else it is
-unseen, which is no change.
+epoch had to have seen several points of it, by its own density there or by its own beams that went through, and did look past it on every
+side: else it is unseen, which is no change. Beams pass in front of a wall that they do not show; behind it, where it stands, none does.
 """
 
 from dataclasses import dataclass
@@ -32,6 +32,10 @@ _MOST_EACH: Final = 3.0
 """Beams that count for one point: a stop over one place must not outweigh all else of a change."""
 _AROUND_M: Final = 1.0
 """Densities are compared within so much."""
+_SIDES: Final = np.array([(np.cos(turn), np.sin(turn), 0.0) for turn in np.arange(8) * np.pi / 4.0])
+_LOOKED: Final = 0.4
+"""Share of the points of a change that the other epoch has to have looked past, on each of these sides: a tenth at a wall that stayed, nine
+tenths where nothing was."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +98,7 @@ def compare(own: Model, other: Model, rule: Rule) -> Compared:
         for cluster, missed, looked in zip(
             found, np.split(expected, ends[:-1]), np.split(seen, ends[:-1]), strict=True
         ):
-            if np.mean(looked) < 0.5 or missed.sum() < _MISSED:
+            if looked.mean(axis=0).min() < _LOOKED or missed.sum() < _MISSED:
                 state[cluster] = UNSEEN
                 continue
             state[cluster] = APPEARED
@@ -138,26 +142,35 @@ def _sure(lies: Odds, cluster: npt.NDArray[Any]) -> Mask:
 
 
 def _expected(rows: npt.NDArray[Any], own: Side, other: Model, rule: Rule) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """How many points of the other epoch each of the points stands for, and whether the other looked there."""
+    """How many points of the other epoch each of the points stands for, and on which sides of it the other looked past, shape (n, 8)."""
     xyz, looked = own.xyz[rows], other.side
     if other.plan is None:
-        return np.zeros(len(rows)), np.zeros(len(rows), np.bool_)
+        return np.zeros(len(rows)), np.zeros((len(rows), len(_SIDES)), np.bool_)
+    beside = (xyz[:, None] + 0.5 * rule.edge_m * _SIDES).reshape(-1, 3)
     if looked.away.any():
-        voxel = np.floor(xyz / rule.edge_m).astype(np.int64)
-        keys, of_point = np.unique(voxel, axis=0, return_inverse=True)
-        of_point = of_point.ravel()
+        keys, of_point = _voxels(xyz, rule.edge_m)
         through, own_through = (passes(keys, each, rule.edge_m) for each in (looked, own))
         held = np.bincount(of_point, minlength=len(keys))
         # of the beams that enter a voxel, so many end in it: the other epoch's would have too
         ends = held / (held + own_through)
-        return np.minimum(through * ends / held, _MOST_EACH)[of_point], (through > 0)[of_point]
+        missed = np.minimum(through * ends / held, _MOST_EACH)[of_point]
+        keys, of_side = _voxels(beside, 0.5 * rule.edge_m)
+        free = passes(keys, looked, 0.5 * rule.edge_m) > 0
+        return missed, free[of_side].reshape(len(rows), -1)
     around = cKDTree(own.xyz[:, :2]).query_ball_point(xyz[:, :2], _AROUND_M, return_length=True)
     there = other.plan.query_ball_point(xyz[:, :2], _AROUND_M, return_length=True)
     # something of the other epoch is behind it, as seen from above
     spacing = np.sqrt(np.pi * _AROUND_M**2 / np.maximum(there, 1))
-    beside, index = other.plan.query(xyz[:, :2])
-    behind = (beside < 1.5 * spacing) & (looked.xyz[index, 2] < xyz[:, 2])
-    return np.asarray(there / np.maximum(around, 1)), behind
+    apart, index = other.plan.query(beside[:, :2])
+    below = looked.xyz[index, 2] < beside[:, 2]
+    behind = (apart < 1.5 * np.repeat(spacing, len(_SIDES))) & below
+    return np.asarray(there / np.maximum(around, 1)), behind.reshape(len(rows), -1)
+
+
+def _voxels(xyz: Array, edge_m: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Numbers of the voxels that hold points, shape (v, 3), and the voxel of each."""
+    keys, of_point = np.unique(np.floor(xyz / edge_m).astype(np.int64), axis=0, return_inverse=True)
+    return keys, of_point.ravel()
 
 
 def _extent(xyz: Array, other: Model, rule: Rule) -> tuple[Array, float]:

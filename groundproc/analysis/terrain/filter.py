@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter
 
+from groundproc.analysis.terrain.halls import halls
 from groundproc.analysis.terrain.pits import amid, narrow_pits, pulling
 from groundproc.analysis.terrain.reach import reach_of, slope_of
 from groundproc.analysis.terrain.settings import Settings, radii
@@ -74,7 +75,12 @@ def bare_ground(lowest_m: Raster, settings: Settings) -> Bare:
     base = np.float32(settings.step_m) + np.float32(settings.relief) * relief
     rise = np.float32(settings.slope) + np.float32(settings.steepness) * slope_of(smooth, settings.cell_m)
     ground = known & (~_objects(surface - smooth, base, rise, settings) | pulls)
-    height = _without(np.where(pulls, lowest_m, surface), ground)
+    surface = np.where(pulls, lowest_m, surface)
+    height = _without(surface, ground)
+    wide = halls(height, ground, known, settings.cell_m)
+    if wide.any():
+        ground &= ~wide
+        height = _without(surface, ground)
     return Bare(height, reach_of(height, settings), ground, pit)
 
 

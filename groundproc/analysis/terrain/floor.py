@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CoverageError
 from groundproc.analysis.terrain.filter import bare_ground, smoothed
+from groundproc.analysis.terrain.halls import HALO_M
 from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
 from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, settings_for
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
@@ -99,7 +100,8 @@ class Floor:
         self.grid = _coarser(fine, times, settings.cell_m)
         self.height, self.reach = Sheet(self.grid, self._folder), Sheet(self.grid, self._folder)
         self.base = Sheet(self.grid, self._folder)
-        halo = round((2.0 * settings.window_m + 4.0 * settings.smoothing_m + FILL_M) / settings.cell_m)
+        halo_m = max(2.0 * settings.window_m + 4.0 * settings.smoothing_m + FILL_M, HALO_M)
+        halo = round(halo_m / settings.cell_m)
         for block, around, cut in blocks(self.grid, halo):
             values = _least(lowest, around, times)
             if np.isfinite(cut(values)).any():

@@ -31,8 +31,8 @@ class Settings:
         ... and so many times r times the slope of the smoothed ground.
     smoothing_m : float
         Sigma of the smoothing.
-    height_m, slack : float
-        A point is ground if it lies within height + slack times local slope of the ground's surface.
+    height_m, slack, bend : float
+        A point is ground if it lies within height + slack times local slope + bend times how slopes around scatter of the ground's surface.
     """
 
     cell_m: float = COARSE_M
@@ -43,7 +43,8 @@ class Settings:
     steepness: float = 0.2
     smoothing_m: float = 4.0
     height_m: float = 0.45
-    slack: float = 1.5
+    slack: float = 0.5
+    bend: float = 1.0
 
 
 PRESETS: Final = {

@@ -1,0 +1,118 @@
+"""Buildings wider than the openings: smooth pieces of what passed for ground that end in a wall all around.
+
+A spur, a bank or a plateau is as wide as a hall, but goes down to its surroundings in a slope somewhere, goes on to the edge of the cloud, or
+has ground above it on one side. So a wider opening takes them all (see the blind alleys), and the rim alone takes the edges of quarries
+among small things; only of pieces that no opening has reached does a rim without a gap tell.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_edt, find_objects, label, maximum_filter
+
+Raster = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+LARGEST_M: Final = 120.0
+"""Longest side of a hall, along the raster."""
+_STEEP: Final = 1.5
+"""Rise over run of a wall between measured cells; a heap of earth stays below one."""
+_DROP_M: Final = 2.0
+"""Of a wall."""
+_RIM_M: Final = 6.0
+"""The ground beside a wall is looked for within this."""
+HALO_M: Final = LARGEST_M + 2.0 * _RIM_M
+"""A piece and what lies beside it end within so much."""
+_SHARE: Final = 0.9
+"""Of the ground beside it that lies below the wall."""
+_BESIDE: Final = 0.3
+"""Of what lies beside it that has to be ground; the rest is trees, other buildings, things that stand there."""
+_ROUNDS: Final = 3
+"""Roofs at several levels go from the top down."""
+
+
+def halls(height_m: Raster, ground: Mask, known: Mask, cell_m: float, largest_m: float = LARGEST_M) -> Mask:
+    """Find them.
+
+    Parameters
+    ----------
+    height_m : ndarray of float32, shape (rows, columns)
+        Of the ground, gaps filled.
+    ground, known : ndarray of bool, shape (rows, columns)
+        Cells that passed for ground, and those that were measured.
+    cell_m, largest_m : float
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, columns)
+        Cells that are no ground.
+    """
+    found = np.zeros_like(ground)
+    pieces, count = label(~_steep(height_m, cell_m))
+    if count < 2:
+        return found
+    reach = 2 * round(_RIM_M / cell_m) + 1
+    near = maximum_filter(known, reach)
+    places = find_objects(pieces)
+    for _ in range(_ROUNDS):
+        before = found.sum()
+        for number, place in enumerate(places, start=1):
+            if place is None or not _whole(place, ground.shape, largest_m / cell_m):
+                continue
+            part = _grown(place, reach, ground.shape)
+            piece = pieces[part] == number
+            own = piece & ground[part]
+            if own.sum() * cell_m**2 < _RIM_M**2 or found[part][own].all():
+                continue
+            if _walled(height_m[part], piece, (ground & ~found)[part], near[part], reach):
+                found[part] |= maximum_filter(piece, 5) & _upper(height_m[part], piece)
+        if found.sum() == before:
+            break
+    return np.asarray(found & ground)
+
+
+def _steep(height: Raster, cell_m: float) -> Mask:
+    """Cells beside a step."""
+    limit = np.float32(_STEEP * cell_m)
+    steep = np.zeros(height.shape, np.bool_)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(height, axis=axis)) > limit
+        ahead: tuple[Any, ...] = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+        behind: tuple[Any, ...] = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        steep[ahead] |= jump
+        steep[behind] |= jump
+    return steep
+
+
+def _whole(place: tuple[slice, ...], shape: tuple[int, ...], largest: float) -> bool:
+    """Whether a piece is small enough, and inside."""
+    return all(
+        0 < own.start and own.stop < size and own.stop - own.start <= largest
+        for own, size in zip(place, shape, strict=True)
+    )
+
+
+def _grown(place: tuple[slice, ...], by: int, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    return tuple(
+        slice(max(own.start - by, 0), min(own.stop + by, size)) for own, size in zip(place, shape, strict=True)
+    )
+
+
+def _walled(height: Raster, piece: Mask, ground: Mask, near: Mask, reach: int) -> bool:
+    """Whether the ground beside a piece lies below it, all around."""
+    beside = maximum_filter(piece, reach) & ~maximum_filter(piece, 3)
+    if not near[beside].all():
+        return False
+    level = beside & ground
+    if level.sum() < _BESIDE * beside.sum():
+        return False
+    row, column = distance_transform_edt(~piece, return_distances=False, return_indices=True)
+    drop = height[row[level], column[level]] - height[level]
+    return bool(np.mean(drop > _DROP_M) >= _SHARE)
+
+
+def _upper(height: Raster, piece: Mask) -> Mask:
+    """Cells at the height of the piece next to them: the rim of a roof, and not the ground below."""
+    row, column = distance_transform_edt(~piece, return_distances=False, return_indices=True)
+    return np.asarray(height[row, column] - height < 0.5 * _DROP_M)
