@@ -1,7 +1,7 @@
 """Buildings wider than the openings: smooth pieces of what passed for ground that end in a wall all around.
 
-A spur, a bank or a plateau is as wide as a hall, but goes down to its surroundings in a slope somewhere, goes on to the edge of the cloud, or
-has ground above it on one side. So a wider opening takes them all (see the blind alleys), and the rim alone takes the edges of quarries
+A spur, a bank or a plateau is as wide as a hall, but goes down to its surroundings in a slope somewhere, goes on to the edge of the cloud,
+or has ground above it on one side. So a wider opening takes them all (see the blind alleys), and the rim alone takes the edges of quarries
 among small things; only of pieces that no opening has reached does a rim without a gap tell.
 """
 
@@ -10,6 +10,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, find_objects, label, maximum_filter
+
+from groundproc.analysis.terrain.settings import Settings
 
 Raster = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -32,41 +34,41 @@ _ROUNDS: Final = 3
 """Roofs at several levels go from the top down."""
 
 
-def halls(height_m: Raster, ground: Mask, known: Mask, cell_m: float, largest_m: float = LARGEST_M) -> Mask:
+def halls(surface_m: Raster, ground: Mask, known: Mask, settings: Settings) -> Mask:
     """Find them.
 
     Parameters
     ----------
-    height_m : ndarray of float32, shape (rows, columns)
-        Of the ground, gaps filled.
+    surface_m : ndarray of float32, shape (rows, columns)
+        Lowest points, gaps filled.
     ground, known : ndarray of bool, shape (rows, columns)
         Cells that passed for ground, and those that were measured.
-    cell_m, largest_m : float
+    settings : Settings
 
     Returns
     -------
     ndarray of bool, shape (rows, columns)
         Cells that are no ground.
     """
-    found = np.zeros_like(ground)
-    pieces, count = label(~_steep(height_m, cell_m))
-    if count < 2:
-        return found
-    reach = 2 * round(_RIM_M / cell_m) + 1
-    near = maximum_filter(known, reach)
+    found, cell_m = np.zeros_like(ground), settings.cell_m
+    pieces, _ = label(~_steep(surface_m, cell_m))
+    # smaller ones are for the openings
+    large = np.flatnonzero(np.bincount(pieces.ravel()) * cell_m**2 >= settings.window_m**2)
     places = find_objects(pieces)
+    left = [number for number in large if number and _whole(places[number - 1], ground.shape, LARGEST_M / cell_m)]
+    reach = 2 * round(_RIM_M / cell_m) + 1
     for _ in range(_ROUNDS):
         before = found.sum()
-        for number, place in enumerate(places, start=1):
-            if place is None or not _whole(place, ground.shape, largest_m / cell_m):
-                continue
-            part = _grown(place, reach, ground.shape)
+        for number in list(left):
+            part = _grown(places[number - 1], reach, ground.shape)
             piece = pieces[part] == number
-            own = piece & ground[part]
-            if own.sum() * cell_m**2 < _RIM_M**2 or found[part][own].all():
+            if not (piece & ground[part]).any():
+                left.remove(number)
                 continue
-            if _walled(height_m[part], piece, (ground & ~found)[part], near[part], reach):
-                found[part] |= maximum_filter(piece, 5) & _upper(height_m[part], piece)
+            near = maximum_filter(known[part], reach)
+            if _walled(surface_m[part], piece, (ground & ~found)[part], near, reach):
+                found[part] |= maximum_filter(piece, 5) & _upper(surface_m[part], piece)
+                left.remove(number)
         if found.sum() == before:
             break
     return np.asarray(found & ground)
@@ -88,7 +90,7 @@ def _steep(height: Raster, cell_m: float) -> Mask:
 def _whole(place: tuple[slice, ...], shape: tuple[int, ...], largest: float) -> bool:
     """Whether a piece is small enough, and inside."""
     return all(
-        0 < own.start and own.stop < size and own.stop - own.start <= largest
+        own.start > 0 and own.stop < size and own.stop - own.start <= largest
         for own, size in zip(place, shape, strict=True)
     )
 
