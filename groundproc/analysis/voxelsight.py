@@ -2,7 +2,9 @@
 
 A voxel lets through the share of beams that entered it and were not thrown back in it. Beams are those of the flight where its
 trajectory is given, else vertical ones from above the cloud. Between two places the shares multiply, each to the power of the way in
-its voxel over its edge. The voxels that hold the two ends are left out: what one stands on does not hide one.
+its voxel over its edge. The voxels that hold the two ends are left out: what one stands on does not hide one. A voxel that no beam met is as
+those beside it in its layer; where none of these was met either, nothing is known, and of no line that crosses it unless the rest of it is
+closed.
 
 One stands on the lowest point of a column, unless all around it there is lower ground: then that point is a crown, whose ground no beam
 met in this column.
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
@@ -35,6 +37,7 @@ Array = npt.NDArray[np.float64]
 
 _EDGE_M: Final = 0.5
 _MOST: Final = 400_000_000
+_UNKNOWN: Final = -1.0
 _CROWN_M: Final = 4.0
 """What stands higher than its surroundings and is narrower than this is nothing to stand on."""
 
@@ -67,11 +70,9 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
         )
     hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m), progress)
     ground = _standing(ground, edge_m)
-    through = np.ones(shape, np.float32)
-    met = hits + passes
-    np.divide(passes, met, out=through, where=met > 0)
+    through = _through(hits, passes)
     grid = Grid(int(first[0]), int(first[1]), int(shape[0]), int(shape[1]), edge_m)
-    total = np.zeros((shape[0], shape[1]))
+    total, known = np.zeros((shape[0], shape[1])), np.zeros((shape[0], shape[1]), np.int64)
     places = _places(task, crs, ground, first, edge_m)
     for place in places:
         one = np.full((shape[0], shape[1]), np.nan)
@@ -79,9 +80,11 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
         i, j = int(np.floor(place[0] / edge_m)) - first[0], int(np.floor(place[1] / edge_m)) - first[1]
         eye = (place[0] / edge_m - first[0], place[1] / edge_m - first[1], (ground[i, j] + above) / edge_m - first[2])
         _transmittance(through, ground / edge_m - first[2], eye, target / edge_m, one)
-        total += one / len(places)
+        known += np.isfinite(one)
+        total += np.nan_to_num(one)
         progress(1)
-    image = total.T[::-1].astype(np.float32)
+    mean = np.divide(total, known, out=np.full(total.shape, np.nan), where=known > 0)
+    image = mean.T[::-1].astype(np.float32)
 
     def block(window: Window) -> npt.NDArray[Any]:
         top, left = grid.row + grid.rows - window.row - window.rows, window.column - grid.column
@@ -124,6 +127,20 @@ def _met(
     if tally is not None:
         tally.check()
     return hits, passes, ground
+
+
+def _through(hits: Any, passes: Any) -> npt.NDArray[np.float32]:
+    """Share of beams that each voxel lets through, `_UNKNOWN` where none met it or those beside it."""
+    through = np.full(hits.shape, _UNKNOWN, np.float32)
+    for layer in range(hits.shape[2]):
+        passed = passes[:, :, layer].astype(np.float64)
+        met = passed + hits[:, :, layer]
+        # sums of whole numbers: what is less than one beam is rounding
+        around = [9.0 * uniform_filter(each, 3, mode="constant") for each in (passed, met)]
+        own, beside = met > 0, (met == 0) & (around[1] > 0.5)
+        np.divide(passed, met, out=through[:, :, layer], where=own, casting="same_kind")
+        np.divide(around[0], around[1], out=through[:, :, layer], where=beside, casting="same_kind")
+    return through
 
 
 def _standing(lowest: Array, edge_m: float) -> Array:
@@ -198,7 +215,7 @@ def _transmittance(through: Any, ground: Any, eye: Any, target: float, out: Any)
             at, last = np.floor(start).astype(np.int64), np.floor(end).astype(np.int64)
             first = at.copy()
             begin(start, way, at, 1.0, step, following, each)
-            share, value = 0.0, 1.0
+            share, value, known = 0.0, 1.0, True
             while share < 1.0 and value > 1e-6:
                 a = next_axis(following)
                 reach = min(following[a], 1.0)
@@ -207,8 +224,13 @@ def _transmittance(through: Any, ground: Any, eye: Any, target: float, out: Any)
                     inside = inside and 0 <= at[b] < through.shape[b]
                 own = (at == first).all() or (at == last).all()
                 if inside and not own:
-                    value *= np.float64(through[at[0], at[1], at[2]]) ** ((reach - share) * length)
+                    own_share = np.float64(through[at[0], at[1], at[2]])
+                    if own_share >= 0.0:
+                        value *= own_share ** ((reach - share) * length)
+                    else:
+                        known = False
                 share = reach
                 at[a] += step[a]
                 following[a] += each[a]
-            out[i1, j1] = value if value > 1e-6 else 0.0
+            if known or value <= 1e-6:
+                out[i1, j1] = value if value > 1e-6 else 0.0

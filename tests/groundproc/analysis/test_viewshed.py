@@ -138,6 +138,20 @@ def cloud(path: Path, xyz: Array, **columns: Any) -> Path:
     return path
 
 
+def test_nothing_is_known_of_a_line_below_a_roof_that_beams_came_down_on(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 30, (60_000, 2))
+    house = (np.abs(xy - 15.0) < 5.0).all(axis=1)
+    path = cloud(tmp_path / "a.laz", np.column_stack([xy, np.where(house, 6.1, 0.1)]))
+    words = ["viewshed", str(path), "--at", "500005.2,6000015.2", "--height", "1.7", "--target-height", "1.7"]
+    assert main([*words, "--mode", "voxels", "-o", str(tmp_path / "t.tif")]) == 0
+    with rasterio.open(tmp_path / "t.tif") as out:
+        value = out.read(1, masked=True).filled(np.nan)
+        behind, beside = (value[out.index(*at)] for at in ((500_025.2, 6_000_015.2), (500_012.2, 6_000_027.2)))
+    assert np.isnan(behind)
+    assert beside == pytest.approx(1.0)
+
+
 def test_leaves_let_through_what_beams_say(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     ground = rng.uniform(0, 40, (300_000, 2))
