@@ -2,9 +2,9 @@
 
 A voxel lets through the share of beams that entered it and were not thrown back in it. Beams are those of the flight where its
 trajectory is given, else vertical ones from above the cloud. Between two places the shares multiply, each to the power of the way in
-its voxel over its edge. The voxels that hold the two ends are left out: what one stands on does not hide one. A voxel that no beam met is as
-those beside it in its layer; where none of these was met either, nothing is known, and of no line that crosses it unless the rest of it is
-closed.
+its voxel over its edge. The voxels that hold the two ends are left out: what one stands on does not hide one. A voxel that no beam met is
+as those beside it in its layer; where none of these was met either, nothing is known, and of no line that crosses it unless the rest of it
+is closed.
 
 One stands on the lowest point of a column, unless all around it there is lower ground: then that point is a crown, whose ground no beam
 met in this column.
