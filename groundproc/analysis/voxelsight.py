@@ -84,7 +84,7 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
         total += np.nan_to_num(one)
         progress(1)
     mean = np.divide(total, known, out=np.full(total.shape, np.nan), where=known > 0)
-    image = mean.T[::-1].astype(np.float32)
+    image: npt.NDArray[np.float32] = mean.T[::-1].astype(np.float32)
 
     def block(window: Window) -> npt.NDArray[Any]:
         top, left = grid.row + grid.rows - window.row - window.rows, window.column - grid.column
