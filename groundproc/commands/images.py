@@ -93,7 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.image_points is not None and arguments.marks is not None:
         raise UsageError("--image-points and --marks: one of the two")
     expect([arguments.cloud], CLOUD, CLOUD_WORDS)
-    expect([arguments.control, arguments.image_points, arguments.marks, arguments.start], TABLE, "a table (CSV)")
+    expect([arguments.control, arguments.image_points, arguments.marks], TABLE, "a table (CSV)")
+    expect([arguments.start], (*TABLE, "orientations"), "poses of images (CSV)")
     claim_folder(arguments.output, results.FILES, arguments.force)
     geoid: float | str | None = arguments.geoid
     with contextlib.suppress(ValueError, TypeError):

@@ -70,6 +70,9 @@ POSES: Final = Kind(
     "a trajectory",
     "`swath process LOG --trajectory {0} -o DIR` places points with it, --positions {0} takes it along",
 )
+ORIENTATIONS: Final = Kind(
+    "orientations", "a table of poses of photographs", "`swath images IMAGES --start {} -o DIR` begins with them"
+)
 ACCURACY: Final = Kind("accuracy", "the accuracy file of an SBET", "it is read together with the SBET beside it")
 OBSERVATIONS: Final = Kind(
     "observations", "a file of raw GNSS observations", "`swath ppk {} --base FILE -o OUT.pos` makes positions of it"
@@ -170,6 +173,7 @@ def _tests(head: bytes, size: int) -> tuple[tuple[Callable[[], bool], Kind], ...
         (lambda: rinex.kind_of(head) != "", OBSERVATIONS),
         (lambda: looks_like_pos(text), SOLUTION),
         (lambda: _trims(text), TRIMS),
+        (lambda: {"image", "omega_deg", "phi_deg", "kappa_deg"} <= _columns(text), ORIENTATIONS),
         (lambda: looks_like_poses(text), POSES),
         (lambda: localposes.looks_like(text) != "", SOLUTION),
         (lambda: looks_like_nmea(head), SOLUTION),

@@ -72,6 +72,24 @@ def exposures_of(log: Path) -> Noted | None:
     return max(found, key=lambda one: len(one.utc_ns)) if found else None
 
 
+def of_flight(logs: Sequence[Path]) -> Noted | None:
+    """All exposures that the logs of one flight note, of the kind that most of them are of; None where they note none.
+
+    Raises
+    ------
+    SwathError
+        One cannot be read.
+    """
+    found = [one for one in map(exposures_of, logs) if one is not None]
+    if not found:
+        return None
+    source = max(found, key=lambda one: len(one.utc_ns)).source
+    alike = [one for one in found if one.source == source]
+    return _in_order(
+        np.concatenate([one.utc_ns for one in alike]), np.concatenate([one.camera for one in alike]), source
+    )
+
+
 def _pieces(path: Path) -> Iterator[bytes]:
     try:
         with path.open("rb") as file:

@@ -14,7 +14,7 @@ from groundproc.geodesy import utm_epsg
 from groundproc.imagery import assembly, flown, located
 from groundproc.imagery.assembly import Known
 from groundproc.imagery.exifrig import rig_of
-from groundproc.imagery.exposures import exposures_of
+from groundproc.imagery.exposures import of_flight
 from groundproc.imagery.imports import load_rig
 from groundproc.imagery.lasting import Lasting
 from groundproc.imagery.logged import trajectory_of
@@ -52,6 +52,8 @@ class Task:
         What is handed back to the smoother: "gained" or "true" (`hybrid`).
     every_s : float
         At most one pose in so many seconds; 0 for every image.
+    noted : tuple of Path
+        Logs of the flight that a trajectory is of: exposures that its autopilot noted there.
     """
 
     output: Path
@@ -70,6 +72,7 @@ class Task:
     geoid: float | str | None = None
     hybrid: str = "gained"
     every_s: float = 0.0
+    noted: tuple[Path, ...] = ()
 
 
 @dataclass(slots=True)
@@ -234,16 +237,17 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
 
 
 def _noted_times(session: Session, task: Task) -> Timed | None:
-    """Times of `--times`, else what the log noted of exposures; None: the images' own clocks."""
+    """Times of `--times`, else what the log of the flight noted of exposures; None: the images' own clocks."""
     if task.times is not None:
         return times_of(task.times, session.names, session.time_ns, session.camera)
-    if task.log is None or not session.pictures:
+    logs = task.noted if task.log is None else (task.log,)
+    if not session.pictures:
         return None
-    noted = exposures_of(task.log)
+    noted = of_flight(logs)
     if noted is None:
         return None
     try:
-        return by_camera(noted, session.time_ns, session.camera, task.log.name)
+        return by_camera(noted, session.time_ns, session.camera, ", ".join(log.name for log in logs))
     except CaptureError as error:
         session.warnings.append(f"{error}; the images' own clocks are used")
         return None

@@ -233,8 +233,9 @@ def _hand_back(task: Task, trajectory: Trajectory, adjusted: Adjusted) -> None:
 def doubts_of(told: dict[str, Any], session: Session, measured: Measurements) -> list[str]:
     """Sentences for who must know."""
     doubts = []
-    if measured.strangers:
-        doubts.append(f"images of the tables that are not in the block: {names_listed(measured.strangers)}")
+    strangers = [name for name in measured.strangers if name not in session.left_out]
+    if strangers:
+        doubts.append(f"images of the tables that are not in the block: {names_listed(strangers)}")
     if session.control is not None:
         seen = {one["name"] for one in (*told["control"], *told["check"])}
         lost = [name for name in session.control.name if name not in seen]

@@ -34,7 +34,7 @@ def work(run: Run, folders: Folders) -> None:
     rig, times = (None if path is None else Path(path) for path in (survey.rig, survey.image_times))
     task = Task(
         folders[WHOLE] / BLOCK, (Path(survey.images),), trajectory=run.folder, rig=rig, cloud=photographs.cloud_of(run),
-        times=times,
+        times=times, noted=tuple(run.request.logs),
     )  # fmt: skip
     told = adjustment.run(task, lambda stage, done: run.progress("images", done))
     left_out = [f"{name} is left out: {why}" for name, why in told["left_out"].items()]

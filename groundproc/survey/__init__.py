@@ -237,7 +237,7 @@ class ImageSettings:
         words=("--image-times",),
         metavar="FILE",
         reads="file",
-        absent="as the photographs state",
+        absent="as the logs note exposures, else as the photographs state",
         in_file=BESIDE,
     )
     panels: str | None = setting(

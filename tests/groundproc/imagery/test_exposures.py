@@ -11,9 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from flightlog.errors import CaptureError
 from groundproc.cli import main
-from groundproc.imagery.exposures import exposures_of
+from groundproc.imagery.exposures import exposures_of, of_flight
 from groundproc.imagery.poses import NO_TIME, read_poses
 from groundproc.imagery.rig import read_rig
+from groundproc.imagery.session import Task, begin
 from groundproc.imagery.site import georeferenced
 from groundproc.imagery.tables import read_control, read_marks
 from groundproc.imagery.times import by_camera, times_of
@@ -66,6 +67,37 @@ def test_images_of_two_cameras_get_their_own_exposures_and_those_that_were_not_n
     assert off_ns[~timed.own].max() <= 1_000
     assert off_ns[timed.own].max() <= 2_000_000
     assert timed.offset_s == pytest.approx(-0.05, abs=1e-3)
+
+
+def test_the_parts_of_a_flight_are_one_and_each_exposure_counts_once(flown: tuple[Path, Simulation]) -> None:
+    folder, _ = flown
+    log = folder / "flight.mcap"
+    once, twice = exposures_of(log), of_flight((log, folder / "telemetry.tlog", log))
+    assert once is not None
+    assert twice is not None
+    np.testing.assert_array_equal(twice.utc_ns, once.utc_ns)
+    np.testing.assert_array_equal(twice.camera, once.camera)
+    assert of_flight(()) is None
+
+
+def test_a_trajectory_goes_with_the_exposures_that_the_logs_of_its_flight_note(flown: tuple[Path, Simulation]) -> None:
+    """Camera b shows another hour: its own clock would put its images an hour off."""
+    folder, simulation = flown
+    images = folder / "images"
+    given = {"trajectory": folder / "truth.csv", "rig": images / "rig.yaml"}
+    session = begin(
+        Task(folder / "out", (images,), **given, noted=(folder / "flight.mcap",)), lambda stage, count: None
+    )
+    true_ns = {
+        simulation.studio.name_of(one): int(simulation.clocks.utc.shows_ns(one.time_s))
+        for one in simulation.studio.exposures
+    }
+    off_ns = [
+        abs(time_ns - true_ns[name]) for name, time_ns in zip(session.names, session.time_ns.tolist(), strict=True)
+    ]
+    assert max(off_ns) <= 2_000_000
+    assert session.timed is not None
+    assert "CAMERA_FEEDBACK" in session.timed.note
 
 
 def test_two_cameras_on_one_trigger_expose_together(flown: tuple[Path, Simulation]) -> None:

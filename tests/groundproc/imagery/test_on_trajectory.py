@@ -126,3 +126,17 @@ def test_images_outside_of_the_flight_are_named_and_the_rest_goes_on(
     assert told["counts"]["images"] == 23
     assert list(told["left_out"]) == [rows[3][0]]
     assert "outside of the trajectory" in capsys.readouterr().err
+
+
+def test_poses_of_a_block_begin_another_one_and_are_no_observations(block: tuple[Path, Flown]) -> None:
+    folder, _ = block
+    adjusted(folder, "--hybrid-every", "5")
+    before = folder / "out---hybrid-every-5"
+    words = ["--image-points", folder / "points.csv", "--rig", folder / "rig.yaml", "--start", before / "poses.csv"]
+    assert main(["images", *map(str, words), "-o", str(folder / "free")]) == 0
+    told, known = (json.loads((out / "bundle.json").read_text()) for out in (folder / "free", before))
+    counts, free = told["counts"], 5
+    assert counts["images"] == known["counts"]["images"]
+    assert told["unknowns"] == 6 * counts["images"] + 3 * counts["points"] + free - 7
+    assert told["observations"] == counts["image_rows"] + counts["camera_rows"]
+    assert 0.9 < told["sigma0"] < 1.1
