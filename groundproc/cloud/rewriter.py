@@ -194,10 +194,10 @@ class Rewriter:
         return out
 
 
-_WITH_COLOUR: Final = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
-"""Point formats with the same fields, and red, green and blue."""
+_WITH_COLOUR: Final = {0: 2, 1: 3, 4: 5, 6: 8, 7: 8, 9: 10}
+"""Point formats with the same fields, and red, green and blue; those of LAS 1.4 with near infrared too, which is 0 where nobody tells."""
 _WITH_NIR: Final = {6: 8, 7: 8, 9: 10}
-"""With near infrared too; the older ones have none, and get it as extra bytes."""
+"""With near infrared; the older ones have none, and get it as extra bytes."""
 
 
 def _format(old: Any, added: Sequence[Dimension]) -> Any:

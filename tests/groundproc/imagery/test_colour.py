@@ -94,7 +94,8 @@ def test_colours_are_those_of_the_scene_at_one_exposure(place: Path, coloured: l
 
 def test_every_point_goes_out_as_it_came_in_and_without_views_it_is_black(place: Path, coloured: laspy.LasData) -> None:
     before = laspy.read(place / "cloud.laz")
-    assert coloured.header.point_format.id == 7
+    assert coloured.header.point_format.id == 8
+    assert not np.asarray(coloured.nir).any()
     for name in ("X", "Y", "Z", "intensity", "gps_time"):
         assert (before[name] == coloured[name]).all()
     one = place / "one"
