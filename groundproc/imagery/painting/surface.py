@@ -22,6 +22,8 @@ _CELL: Final = 1.5
 """Of the surface, in spacings of the points: few cells are then empty."""
 _BRIDGED: Final = 3
 """Cells that a gap may be from the nearest point."""
+_ROAD_M: Final = 6.0
+"""Between ground on all sides a gap may be so wide: a lidar sees little of fresh asphalt or a puddle, and cameras see it."""
 _STEP_M: Final = 0.4
 """Between neighbouring cells: an edge, across which nothing is interpolated."""
 _OBJECT_M: Final = 2.0
@@ -89,12 +91,25 @@ def surface_of(cloud: reader.Cloud, spacing_m: float, least_m: float, all_classe
     known = _topped(cells.window(grid, "max"))
     there = np.isfinite(known)
     filled = fill(known)
-    height = np.where(ndimage.distance_transform_edt(~there) <= _BRIDGED, filled, np.nan).astype(np.float32)
+    near = ndimage.distance_transform_edt(~there) <= _BRIDGED
     radius = max(1, round(0.5 * _WIDEST_M / grid.cell_m))
     with np.errstate(invalid="ignore"):
         high = filled - opened(filled, radius) > _OBJECT_M
+    bridged = _closed(there & ~high, 0.5 * _ROAD_M / grid.cell_m) & ~high
+    height = np.where(near | bridged, filled, np.nan).astype(np.float32)
     part, parts = ndimage.label(high & np.isfinite(height))
     return Surface(grid, height, part.astype(np.int32), int(parts))
+
+
+def _closed(there: npt.NDArray[np.bool_], radius: float) -> npt.NDArray[np.bool_]:
+    """Cells that no disc of a radius [cells] can hold without meeting some that are there: gaps that are narrow, and no surroundings."""
+    wide = int(np.ceil(radius)) + 1
+    padded = np.pad(there, wide)
+    if not padded.any():
+        return there
+    reached = ndimage.distance_transform_edt(~padded) <= radius
+    kept = ndimage.distance_transform_edt(reached) > radius
+    return np.asarray(kept[wide:-wide, wide:-wide] | there)
 
 
 def _topped(known: Raster) -> Raster:
