@@ -3,6 +3,10 @@
 Every fifth station loses its image points. Its pose is then the trajectory's, with the mounting and the clock that the others found, and
 the points that the others placed are looked at from there. All groups are free to begin with, and the one that helps least is taken away
 until every one that is left helps: a boresight that is tried while a clock is still off by pixels makes nothing better.
+
+What a view shows of its own strip alone moves with the strip: a clock that is off shows in the fewer points that strips of other
+headings share, and a median does not see them. So it is the RMS within a view that counts, of all but the worst, and the geometric mean
+of the views: one whose pose is bad anyway, as in a gap of GNSS, is so with and without, and drowns nothing.
 """
 
 from collections.abc import Sequence
@@ -22,7 +26,11 @@ Mask = npt.NDArray[np.bool_]
 LEAST_STATIONS: Final = 10
 EVERY: Final = 5
 BETTER: Final = 0.98
-"""What is accepted makes the median residual of held-out views at least so much smaller."""
+"""What is accepted makes the residuals of held-out views at least so much smaller."""
+KEPT: Final = 0.95
+"""Of the points of a held-out view; the others may be wrong matches that were not found."""
+LEAST_POINTS: Final = 5
+"""That a held-out view judges by."""
 BORESIGHT: Final = ("boresight_x", "boresight_y", "boresight_z", "lever_x", "lever_y", "lever_z")
 GROUPS: Final = (("boresight", BORESIGHT), ("timeshift", ("timeshift",)), ("line_delay", ("line_delay",)))
 
@@ -75,7 +83,7 @@ def _unknowns_of(groups: Sequence[str], wanted: Sequence[tuple[str, ...]]) -> tu
 
 
 def _error(block: Block, known: tuple[RigCamera, ...], mounting: tuple[tuple[str, ...], ...], held: Mask) -> float:
-    """Median residual of held-out measurements [px] with some unknowns of the mounting."""
+    """Residual of held-out views [px] with some unknowns of the mounting: the geometric mean of the RMS of each."""
     weight = np.where(held, 0.0, block.measured.weight)
     training = replace(block, measured=replace(block.measured, weight=weight), mounting=mounting)
     # points that only held-out views see say nothing
@@ -84,4 +92,9 @@ def _error(block: Block, known: tuple[RigCamera, ...], mounting: tuple[tuple[str
     solved = solve(replace(training, measured=replace(training.measured, weight=weight)), known)
     residual, reached = image_residuals(solved.block, solved.unknowns)
     seen = held & (block.measured.weight > 0.0) & reached & kept.determined[block.measured.point]
-    return float(np.median(np.linalg.norm(residual[seen], axis=1))) if seen.any() else float("inf")
+    found = []
+    for image in np.unique(block.measured.image[seen]):
+        square = np.sort(np.square(residual[seen & (block.measured.image == image)]).sum(axis=1))
+        if len(square) >= LEAST_POINTS:
+            found.append(0.5 * np.log(square[: int(np.ceil(KEPT * len(square)))].mean()))
+    return float(np.exp(np.mean(found))) if found else float("inf")
