@@ -34,8 +34,14 @@ MOST_STATIONS: Final = 80
 MOST_KEPT: Final = 0.9999
 DEPARTS: Final = 3.0
 """Sigmas, RMS, beyond which a trajectory departs from its block by more than errors that last explain."""
+STATED: Final = float(np.log(2.0))
+"""Sigma of the logarithm of the multiple: a trajectory's variances are as stated, to a factor of two or so, unless the images insist.
+
+A process ten times as large that lasts ten times as long changes from image to image like a small short one, and over some minutes of
+flight nothing tells them apart. But the mean of the one is worth little, so that the block would hang on a few poses alone.
+"""
 BY_CHANCE: Final = 3.0
-"""Logarithm of likelihood that a time constant and a size have to gain."""
+"""Logarithm of probability that a time constant and a size have to gain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,17 +114,17 @@ def told_by(adjusted: Adjusted, stated: PosePriors) -> Lasting:
 
 
 def likeliest(told: "Told") -> Lasting:
-    """What makes the observed poses likeliest; independent errors as stated where that is as good, but for chance."""
+    """What is likeliest by the poses and by the sigmas that they state; independent errors where that is as good, but for chance."""
     step_s = float(np.median(np.diff(told.time_s)))
     taus_s = [0.0, *np.geomspace(max(0.4 * step_s, 1e-3), max(LONGEST_S, step_s), TAUS).tolist()]
     best = Lasting()
-    likelihood = told.likelihood(best)
+    posterior = told.likelihood(best)
     for what in ("place", "turn", "place"):
         trials = [replace(best, **{what: size, f"{what}_s": tau_s}) for size, tau_s in itertools.product(SIZES, taus_s)]
-        found = [told.likelihood(trial) for trial in trials]
+        found = [told.likelihood(trial) - _unlikely(trial) for trial in trials]
         first = int(np.argmax(found))
-        if found[first] > likelihood + BY_CHANCE:
-            best, likelihood = trials[first], found[first]
+        if found[first] > posterior + BY_CHANCE:
+            best, posterior = trials[first], found[first]
     return best
 
 
@@ -193,6 +199,11 @@ class Told:
         spread = np.log(np.diag(lower)).sum() + 1.5 * count * np.log(lasting.place * lasting.turn)
         spread += 1.5 * np.log(1.0 - kept**2).sum()
         return float(0.5 * (pulled @ pulled - square) - spread)
+
+
+def _unlikely(lasting: Lasting) -> float:
+    """By how much less likely sizes are than those stated, before the images are asked: a logarithm."""
+    return float(0.5 * np.square(np.log([lasting.place, lasting.turn]) / STATED).sum())
 
 
 def _without_rounding(matrix: Array, scale: Array) -> Array:
