@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import signal
 import time
 from collections.abc import Callable
@@ -105,17 +106,37 @@ def _render(folder: Path, scene: str, seconds: float, seed: int, options: Any, e
     write_json(folder / TRUTH, simulation.truth())
 
 
+def _once(folder: Path, make: Callable[[], None]) -> None:
+    """Have a folder filled by the first worker that asks; the others wait for it."""
+    done = folder.with_name(f"{folder.name}.done")
+    try:
+        folder.mkdir()
+    except FileExistsError:  # made already, or another worker is at it
+        deadline = time.monotonic() + 900.0
+        while not done.exists():
+            assert time.monotonic() < deadline, f"{folder.name}: the worker that makes it has not finished in 900 s"
+            time.sleep(0.1)
+        return
+    make()
+    done.touch()
+
+
 @pytest.fixture(scope="session")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulated]:
+def common(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all workers of a test run share."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "simulated"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def simulated(common: Path) -> Callable[..., Simulated]:
     """A function that simulates: simulated(name, scene, seconds, options, seed=..., every=...); the name is its folder.
 
     What takes long and is asked for rarely is made on demand: points=True the true echoes, board=True the board's own log.
     """
     from simulator.recording import BOARD, POINTS
-
-    base = tmp_path_factory.getbasetemp()
-    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "simulated"
-    shared.mkdir(exist_ok=True)
 
     def get(
         name: str,
@@ -128,20 +149,56 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Simulat
         points: bool = False,
         board: bool = False,
     ) -> Simulated:
-        folder, done = shared / name, shared / f"{name}.done"
-        try:
-            folder.mkdir()
-        except FileExistsError:  # made already, or another worker is at it
-            deadline = time.monotonic() + 900.0
-            while not done.exists():
-                assert time.monotonic() < deadline, f"{name}: the worker that simulates it has not finished in 900 s"
-                time.sleep(0.1)
-            return Simulated(folder)
-        _render(folder, scene, seconds, seed, options, every, *[POINTS] * points, *[BOARD] * board)
-        done.touch()
-        return Simulated(folder)
+        more = [POINTS] * points + [BOARD] * board
+        _once(common / name, lambda: _render(common / name, scene, seconds, seed, options, every, *more))
+        return Simulated(common / name)
 
     return get
+
+
+@pytest.fixture(scope="session")
+def adjustment(common: Path) -> Callable[[Simulated], Any]:
+    """A function that gives the best estimate of a simulated flight, begun from its nominal mount: a whole adjustment, solved once."""
+    from flightlog.logfile import LogReader
+    from groundproc.accuracy.truth import read_truth
+    from groundproc.estimation import methods
+    from groundproc.estimation.method import gather
+    from groundproc.flight.flight import read_flight
+    from groundproc.flight.pairing import legs
+    from groundproc.survey import Survey
+
+    def get(flight: Simulated) -> Any:
+        folder = common / f"{flight.folder.name}_adjustment"
+
+        def make() -> None:
+            truth = read_truth(flight.folder)
+            with LogReader(truth.log) as reader:
+                read = read_flight([reader], "ins")
+                timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+                given = gather([reader], read, timeline, truth.nominal_mount, Survey())
+                made = methods.estimate(given, lambda stage, size: None)
+            (folder / "estimate.pickle").write_bytes(pickle.dumps(made))
+
+        _once(folder, make)
+        return pickle.loads((folder / "estimate.pickle").read_bytes())
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def house_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """A third of the flight by which methods are judged: along buildings at 5 m/s, gyros at 100 Hz, boresight, delay and scales off."""
+    from simulator.plans import plan
+
+    return simulated("house_flight", "village", 20.0, plan("survey_fast_gyro").options, seed=11, points=True)
+
+
+@pytest.fixture(scope="session")
+def meadow_flight(simulated: Callable[..., Simulated]) -> Simulated:
+    """Three seconds of hover, the take-off and two thirds of a line over rough ground with tufts, trees and two cars."""
+    from simulator.plans import plan
+
+    return simulated("meadow_flight", "meadow", 16.0, plan("meadow").options, seed=31)
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,6 @@ from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 
 Array = npt.NDArray[np.float64]
-SECONDS = 20.0
 EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 UNDULATION_M = 29.354
 """Of the simulator's origin."""
@@ -36,11 +35,9 @@ ANTENNA = np.array([0.1, -0.2, 0.3])
 
 
 @pytest.fixture(scope="module")
-def flight(simulated: Callable[..., Any]) -> Any:
+def flight(house_flight: Any) -> Any:
     """The flight of the tests of the adjustment itself."""
-    from simulator.plans import plan
-
-    return simulated("adjusted_flight", "village", SECONDS, plan("survey_fast_gyro").options, seed=11, points=True)
+    return house_flight
 
 
 @contextmanager
@@ -63,10 +60,10 @@ class Made:
     relative_m: float
 
 
-def made(folder: Path, survey: Survey) -> Made:
+def made(folder: Path, survey: Survey, solved: Estimate | None = None) -> Made:
     truth = read_truth(folder)
     with given_of(truth, survey) as given:
-        estimate = methods.estimate(given, lambda stage, size: None)
+        estimate = solved or methods.estimate(given, lambda stage, size: None)
         lasers = estimate.corrections.table(given.lidar.lasers)
         found = on_lidar_clock(estimate.trajectory, given.timeline[0].lidar_line, truth)
     true, covered = truth.trajectory.where_covered(found.time_ns)
@@ -84,8 +81,8 @@ def made(folder: Path, survey: Survey) -> Made:
 
 
 @pytest.fixture(scope="module")
-def plain(flight: Any) -> Made:
-    return made(flight.folder, Survey(method="adjusted"))
+def plain(flight: Any, adjustment: Callable[[Any], Estimate]) -> Made:
+    return made(flight.folder, Survey(method="adjusted"), adjustment(flight))
 
 
 def write_pos(folder: Path, out: Path, sigma_m: Array, rng: np.random.Generator, wrong: slice = slice(0, 0)) -> None:

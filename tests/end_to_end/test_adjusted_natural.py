@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import Judgement, judge
@@ -17,35 +16,26 @@ from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 
-SECONDS = 16.0
 
-
-@pytest.fixture(scope="module")
-def meadow(simulated: Callable[..., Any]) -> Any:
-    """Three seconds of hover, the take-off and two thirds of a line over rough ground with tufts, trees and two cars."""
-    from simulator.plans import plan
-
-    return simulated("adjusted_meadow", "meadow", SECONDS, plan("meadow").options, seed=31)
-
-
-def judged(folder: Path, survey: Survey) -> tuple[Estimate, Judgement]:
+def judged(folder: Path, survey: Survey, solved: Estimate | None = None) -> tuple[Estimate, Judgement]:
     truth = read_truth(folder)
     with LogReader(truth.log) as reader:
         read = read_flight([reader], "ins")
         timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
         given = gather([reader], read, timeline, truth.nominal_mount, survey)
-        made = methods.estimate(given, lambda stage, size: None)
+        made = solved or methods.estimate(given, lambda stage, size: None)
         placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
         return made, judge([], truth, placed, made.mount)
 
 
-def test_over_a_meadow_trees_and_tufts_hold_the_path(meadow: Any) -> None:
+def test_over_a_meadow_trees_and_tufts_hold_the_path(meadow_flight: Any, adjustment: Callable[[Any], Estimate]) -> None:
     """It was lost here by metres: noisy normals of the ground braked the take-off, and what is no plane counted for nothing.
 
     The batch, which had the ground alone, bent the three seconds of hover by 0.4 m: trees and tufts hold it too.
     """
-    made, found = judged(meadow.folder, Survey(method="adjusted"))
-    _, smoothed = judged(meadow.folder, Survey(method="filtered"))
+    made, found = judged(meadow_flight.folder, Survey(), adjustment(meadow_flight))
+    assert made.method == "adjusted"
+    _, smoothed = judged(meadow_flight.folder, Survey(method="filtered"))
     assert made.report["restarts"] == 0
     assert made.report["blind_s"] <= 1.0  # while the map is young
     assert made.warning == ""
@@ -56,9 +46,9 @@ def test_over_a_meadow_trees_and_tufts_hold_the_path(meadow: Any) -> None:
     assert np.isfinite(made.trajectory.sigma_position_m).all()
 
 
-def test_in_time_the_odometry_keeps_the_way_over_a_meadow(meadow: Any) -> None:
+def test_in_time_the_odometry_keeps_the_way_over_a_meadow(meadow_flight: Any) -> None:
     """Once the speed is known, some seconds after the start."""
-    _, found = judged(meadow.folder, Survey(method="adjusted", causal=True))
+    _, found = judged(meadow_flight.folder, Survey(method="adjusted", causal=True))
     later = found.courses["time_s"] > 6.0
     assert np.median(found.courses["position_error_m"][later]) <= 0.05
     assert np.median(found.courses["rotation_error_deg"][later]) <= 0.1

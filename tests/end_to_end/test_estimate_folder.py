@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +23,9 @@ SECONDS = 11.0
 
 
 @pytest.fixture(scope="module")
-def flight(simulated: Callable[..., Any]) -> Any:
+def flight(house_flight: Any) -> Any:
     """A boresight that is off by up to a degree."""
-    from simulator.plans import plan
-
-    return simulated("adjusted_flight", "village", 20.0, plan("survey_fast_gyro").options, seed=11, points=True)
+    return house_flight
 
 
 @pytest.fixture(scope="module")

@@ -40,13 +40,15 @@ def town(seed: int = 1) -> Array:
 def seen(faces: Array, eye: Array, ray: Array) -> Array:
     """Range of the nearest face along rays, shape (n,); infinite where there is none."""
     best = np.full(len(ray), np.inf)
+    eye = np.broadcast_to(eye, ray.shape)
     for corner, u, v in faces:
         normal = np.cross(u, v)
         with np.errstate(divide="ignore", invalid="ignore"):
             t = ((corner - eye) @ normal) / (ray @ normal)
-        hit = eye + t[:, None] * ray - corner
+        near = np.flatnonzero((t > 1) & (t < best))
+        hit = eye[near] + t[near, None] * ray[near] - corner
         across = np.linalg.solve(np.stack([u, v, normal], axis=1), hit.T)
-        good = (t > 1) & (t < best) & (across[:2] >= 0).all(axis=0) & (across[:2] <= 1).all(axis=0)
+        good = near[(across[:2] >= 0).all(axis=0) & (across[:2] <= 1).all(axis=0)]
         best[good] = t[good]
     return best
 

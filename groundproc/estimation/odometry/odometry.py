@@ -155,14 +155,16 @@ class Odometry:
             # in the body at the slice's end, where the prediction between the instants stands
             before, end_m = _mat(s.quat), s.position_m.copy()
             body = (world - end_m) @ before
+            # a column of a table is another type of array than one of one row, and what takes it compiles for half a minute
+            returns = np.ascontiguousarray(clusters["count"])
             matched, residual, unheld, s.covariance = update(
-                self.map.arrays, body, clusters["count"], s.arrays, s.covariance, self._ground
+                self.map.arrays, body, returns, s.arrays, s.covariance, self._ground
             )
             # the slice is corrected as one rigid piece
             turn = _mat(s.quat) @ before.T
             positions, world = (s.position_m + (each - end_m) @ turn.T for each in (positions, world))
             quats = frames.quat_multiply(frames.quat_from_mat(turn[None]), quats)
-            seen = Seen(clusters["time_ns"] - start_ns, world, clusters["count"])
+            seen = Seen(clusters["time_ns"] - start_ns, world, returns)
             within = self._within(seen, positions, turn, (self.map.arrays, self._ground))
             quats = frames.quat_multiply(frames.quat_exp(within), quats)
         self.map.insert(world, clusters, self.MOST)

@@ -4,7 +4,6 @@ import gzip
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -112,24 +111,33 @@ class Flown:
     ins: Errors
     filtered: Errors
     report: dict[str, Any]
-
-    @cached_property
-    def solution(self) -> Solution:
-        """All states of the flight's log as it is, which takes as long as the estimate: for who looks at them."""
-        with given_of(self.simulated.log) as given:
-            return filtered.solve_leg(given, given.placed[0], given.fixes[0])
+    solution: Solution
+    """All states of the estimate's only leg."""
+    given: Given
+    """What both methods were given; its log is closed, and of the inertial methods none looks into it."""
 
 
 def fly(simulated: Any, change: Callable[[Flight], None] | None = None) -> Flown:
-    with given_of(simulated.log, change) as given:
+    solutions: list[Solution] = []
+    solve_leg = filtered.solve_leg
+
+    def kept(*arguments: Any) -> Solution:
+        solutions.append(solve_leg(*arguments))
+        return solutions[-1]
+
+    with given_of(simulated.log, change) as given, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(filtered, "solve_leg", kept)
         raw = direct.ins_estimate(given, quiet).trajectory
         estimate = filtered.filtered_estimate(given, quiet)
+    (solution,) = solutions
     assert estimate.warning == ""
     return Flown(
         simulated,
         errors(raw, simulated, raw.frame),
         errors(estimate.trajectory, simulated, raw.frame),
         estimate.report["legs"][0],
+        solution,
+        given,
     )
 
 
@@ -192,7 +200,7 @@ def test_the_covariance_of_roll_pitch_and_heading_is_that_of_turned_attitudes(or
     after = np.stack(frames.attitude_of(frames.mat_from_quat(frames.quat_exp(drawn[:, 3:])) @ mat), axis=1)
     angles = ((after - before + np.pi) % (2 * np.pi) - np.pi)[:, [2, 1, 0]]
     wanted = np.cov(np.hstack([drawn[:, :3], angles]).T) * 1e4
-    trajectory = filtered.trajectory_in(solution_frame(flown), solution)
+    trajectory = filtered.trajectory_in(flown.given.frame, solution)
     found = trajectory.covariance_at(solution.kept_ns[[at]])[0]
     sigma = np.sqrt(np.diag(wanted))
     np.testing.assert_allclose(found / np.outer(sigma, sigma), wanted / np.outer(sigma, sigma), atol=5 / 316)
@@ -200,7 +208,7 @@ def test_the_covariance_of_roll_pitch_and_heading_is_that_of_turned_attitudes(or
 
 def test_sigmas_are_the_roots_of_the_covariances_diagonals(ordinary: list[Flown]) -> None:
     for flown in ordinary:
-        trajectory = filtered.trajectory_in(solution_frame(flown), flown.solution)
+        trajectory = filtered.trajectory_in(flown.given.frame, flown.solution)
         covariance = trajectory.covariance_at(trajectory.time_ns)
         sigma = np.hstack([trajectory.sigma_position_m, trajectory.sigma_attitude_rad])
         np.testing.assert_allclose(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), sigma, rtol=1e-12)
@@ -221,7 +229,7 @@ def test_errors_are_those_that_the_covariance_allows(ordinary: list[Flown]) -> N
             slot = np.searchsorted(solution.kept_ns, kept)
             near = np.clip(np.searchsorted(poses["utc_ns"], kept), 0, len(poses) - 1)
             if first == POSITION:
-                frame = solution_frame(flown)
+                frame = flown.given.frame
                 place = frame.from_geodetic(
                     poses["latitude_deg"][near], poses["longitude_deg"][near], poses["height_m"][near]
                 )
@@ -238,11 +246,6 @@ def test_errors_are_those_that_the_covariance_allows(ordinary: list[Flown]) -> N
             mean.append(float(np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0]).mean()))
         total = len(SEEDS) * 3
         assert chi2.ppf(0.001, total) < np.sum(mean) < chi2.ppf(0.999, total)
-
-
-def solution_frame(flown: Flown) -> LocalFrame:
-    with given_of(flown.simulated.log) as given:
-        return given.frame
 
 
 def test_biases_of_the_autopilots_gyros_are_found(simulated: Any) -> None:
@@ -340,22 +343,22 @@ def outside(flown: Flown, frame: LocalFrame, lever_m: Array, every_s: float, sig
 
 def test_poses_that_were_adjusted_together_keep_their_shape_and_say_what_they_share(ordinary: list[Flown]) -> None:
     flown, off_m, own_m = ordinary[0], np.array([0.05, -0.04, 0.06]), 0.003
-    with given_of(flown.simulated.log) as given:
-        plain = outside(flown, given.frame, np.zeros(3), 2.0, own_m)
-        stated = flown.simulated.poses[500::1000]
-        mat = frames.mat_local_ins(*(np.deg2rad(stated[n]) for n in ("heading_deg", "pitch_deg", "roll_deg")))
-        count = len(stated)
-        own = np.diag([own_m**2] * 3 + [np.deg2rad(0.02) ** 2] * 3)
-        shared = np.diag([*np.square(off_m), *[np.deg2rad(0.05) ** 2] * 3])
-        # where a pose stands by itself is of no account here, and as it is said to be metres away it would show
-        step = np.tile([-3.0, 2.0, -1.0, 0.0, 0.0, 0.0], (count, 1))
-        tied = Tied(step, np.tile(own, (count, 1, 1)), np.tile(shared, (count, 1, 1)))
-        poses = replace(
-            plain, position_m=plain.position_m + off_m - step[:, :3], quat_local_ins_wxyz=frames.quat_from_mat(mat),
-            attitude_covariance_rad2=np.tile(np.eye(3), (count, 1, 1)), tied=tied,
-        )  # fmt: skip
-        estimate = filtered.filtered_estimate(given, quiet, [poses])
-        found = errors(estimate.trajectory, flown.simulated, given.frame)
+    given = flown.given
+    plain = outside(flown, given.frame, np.zeros(3), 2.0, own_m)
+    stated = flown.simulated.poses[500::1000]
+    mat = frames.mat_local_ins(*(np.deg2rad(stated[n]) for n in ("heading_deg", "pitch_deg", "roll_deg")))
+    count = len(stated)
+    own = np.diag([own_m**2] * 3 + [np.deg2rad(0.02) ** 2] * 3)
+    shared = np.diag([*np.square(off_m), *[np.deg2rad(0.05) ** 2] * 3])
+    # where a pose stands by itself is of no account here, and as it is said to be metres away it would show
+    step = np.tile([-3.0, 2.0, -1.0, 0.0, 0.0, 0.0], (count, 1))
+    tied = Tied(step, np.tile(own, (count, 1, 1)), np.tile(shared, (count, 1, 1)))
+    poses = replace(
+        plain, position_m=plain.position_m + off_m - step[:, :3], quat_local_ins_wxyz=frames.quat_from_mat(mat),
+        attitude_covariance_rad2=np.tile(np.eye(3), (count, 1, 1)), tied=tied,
+    )  # fmt: skip
+    estimate = filtered.filtered_estimate(given, quiet, [poses])
+    found = errors(estimate.trajectory, flown.simulated, given.frame)
     inside = (found.time_s > 3.0) & (found.time_s < SECONDS - 4.0)
     # the inertial sensors carry it two seconds from pose to pose; 3 m are what the fixes are off
     assert np.abs(found.position[inside].mean(axis=0) - off_m).max() < 0.015
@@ -366,8 +369,8 @@ def test_poses_that_were_adjusted_together_keep_their_shape_and_say_what_they_sh
 
 
 def test_what_tied_poses_share_fades_where_there_are_none(ordinary: list[Flown]) -> None:
-    with given_of(ordinary[0].simulated.log) as given:
-        plain = outside(ordinary[0], given.frame, np.zeros(3), 2.0, 0.01)
+    given = ordinary[0].given
+    plain = outside(ordinary[0], given.frame, np.zeros(3), 2.0, 0.01)
     some = plain.between(int(plain.time_ns[3]), int(plain.time_ns[5]))
     part = np.linspace(1.0, 3.0, 3)[:, None, None] * np.eye(6)
     tied = replace(some, tied=Tied(np.zeros((3, 6)), np.tile(np.eye(6), (3, 1, 1)), part))
@@ -379,10 +382,10 @@ def test_what_tied_poses_share_fades_where_there_are_none(ordinary: list[Flown])
 
 def test_a_better_receiver_gives_its_accuracy(ordinary: list[Flown]) -> None:
     flown, lever_m = ordinary[0], np.array([0.1, -0.2, 0.3])
-    with given_of(flown.simulated.log) as given:
-        better = outside(flown, given.frame, lever_m, 1.0, 0.03)
-        estimate = filtered.filtered_estimate(given, quiet, [better])
-        found = errors(estimate.trajectory, flown.simulated, given.frame)
+    given = flown.given
+    better = outside(flown, given.frame, lever_m, 1.0, 0.03)
+    estimate = filtered.filtered_estimate(given, quiet, [better])
+    found = errors(estimate.trajectory, flown.simulated, given.frame)
     inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
     assert np.sqrt(np.mean(np.square(found.position[inside]))) < 0.06
     assert (np.abs(found.position[inside]) < 2.0 * found.sigma_position[inside]).mean() > 0.85
@@ -394,18 +397,18 @@ def test_a_better_receiver_gives_its_accuracy(ordinary: list[Flown]) -> None:
 def test_sigmas_know_that_errors_of_a_receiver_last(ordinary: list[Flown]) -> None:
     """Errors that last for 10 s are followed, not averaged: with white ones assumed two of three are beyond two sigmas."""
     flown, sigma_m, keep = ordinary[0], 0.03, np.exp(-0.2 / 10.0)
-    with given_of(flown.simulated.log) as given:
-        better = outside(flown, given.frame, np.zeros(3), 0.2, 1e-6)
-        drawn = np.random.default_rng(5).standard_normal((len(better), 3))
-        for n in range(1, len(drawn)):
-            drawn[n] = keep * drawn[n - 1] + np.sqrt(1.0 - keep**2) * drawn[n]
-        better = replace(
-            better,
-            position_m=better.position_m + sigma_m * drawn,
-            covariance_m2=np.tile(np.eye(3) * sigma_m**2, (len(better), 1, 1)),
-        )
-        estimate = filtered.filtered_estimate(given, quiet, [better])
-        found = errors(estimate.trajectory, flown.simulated, given.frame)
+    given = flown.given
+    better = outside(flown, given.frame, np.zeros(3), 0.2, 1e-6)
+    drawn = np.random.default_rng(5).standard_normal((len(better), 3))
+    for n in range(1, len(drawn)):
+        drawn[n] = keep * drawn[n - 1] + np.sqrt(1.0 - keep**2) * drawn[n]
+    better = replace(
+        better,
+        position_m=better.position_m + sigma_m * drawn,
+        covariance_m2=np.tile(np.eye(3) * sigma_m**2, (len(better), 1, 1)),
+    )
+    estimate = filtered.filtered_estimate(given, quiet, [better])
+    found = errors(estimate.trajectory, flown.simulated, given.frame)
     inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
     assert np.sqrt(np.mean(np.square(found.position[inside]))) < 1.3 * sigma_m
     assert (np.abs(found.position[inside]) < 2.0 * found.sigma_position[inside]).mean() > 0.85
@@ -414,10 +417,10 @@ def test_sigmas_know_that_errors_of_a_receiver_last(ordinary: list[Flown]) -> No
 
 def test_wild_outside_positions_do_no_harm(ordinary: list[Flown]) -> None:
     flown = ordinary[0]
-    with given_of(flown.simulated.log) as given:
-        better = outside(flown, given.frame, np.zeros(3), 1.0, 0.03)
-        better.position_m[7] += 20.0
-        found = errors(filtered.filtered_estimate(given, quiet, [better]).trajectory, flown.simulated, given.frame)
+    given = flown.given
+    better = outside(flown, given.frame, np.zeros(3), 1.0, 0.03)
+    better.position_m[7] += 20.0
+    found = errors(filtered.filtered_estimate(given, quiet, [better]).trajectory, flown.simulated, given.frame)
     inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
     assert np.sqrt(np.mean(np.square(found.position[inside]))) < 0.3
 
@@ -464,16 +467,16 @@ def test_heights_between_poses_hold_though_accelerometers_shake_and_are_two_per_
 
 def test_poses_of_images_every_ten_seconds(ordinary: list[Flown]) -> None:
     flown = ordinary[1]
-    with given_of(flown.simulated.log) as given:
-        rare = outside(flown, given.frame, np.zeros(3), 10.0, 0.1)
-        poses = flown.simulated.poses[500::5000]
-        true = frames.mat_local_ins(*(np.deg2rad(poses[n]) for n in ("heading_deg", "pitch_deg", "roll_deg")))
-        rare = replace(
-            rare,
-            quat_local_ins_wxyz=frames.quat_from_mat(true),
-            attitude_covariance_rad2=np.tile(np.eye(3) * np.deg2rad(0.1) ** 2, (len(rare), 1, 1)),
-        )
-        found = errors(filtered.filtered_estimate(given, quiet, [rare]).trajectory, flown.simulated, given.frame)
+    given = flown.given
+    rare = outside(flown, given.frame, np.zeros(3), 10.0, 0.1)
+    poses = flown.simulated.poses[500::5000]
+    true = frames.mat_local_ins(*(np.deg2rad(poses[n]) for n in ("heading_deg", "pitch_deg", "roll_deg")))
+    rare = replace(
+        rare,
+        quat_local_ins_wxyz=frames.quat_from_mat(true),
+        attitude_covariance_rad2=np.tile(np.eye(3) * np.deg2rad(0.1) ** 2, (len(rare), 1, 1)),
+    )
+    found = errors(filtered.filtered_estimate(given, quiet, [rare]).trajectory, flown.simulated, given.frame)
     assert np.sqrt(np.mean(np.square(found.position))) < 1.0
     assert rms_deg(found.attitude[:, 2]) < 1.0
 
@@ -517,11 +520,11 @@ def test_positions_are_named_in_the_survey(ordinary: list[Flown], tmp_path: Path
     lines = [",".join([*names, "sigma_east_m", "sigma_north_m", "sigma_up_m"])]
     lines += [",".join([*(repr(row[n].item()) for n in names), "0.05", "0.05", "0.05"]) for row in poses]
     (tmp_path / "better.csv").write_text("\n".join(lines) + "\n")
-    with given_of(flown.simulated.log) as given:
-        named = replace(given, survey=Survey(method="filtered", positions=str(tmp_path / "better.csv")))
-        found = errors(methods.estimate(named, quiet).trajectory, flown.simulated, given.frame)
-        with pytest.raises(UsageError, match="only method adjusted or filtered"):
-            methods.estimate(replace(named, survey=replace(named.survey, method="ins")), quiet)
+    given = flown.given
+    named = replace(given, survey=Survey(method="filtered", positions=str(tmp_path / "better.csv")))
+    found = errors(methods.estimate(named, quiet).trajectory, flown.simulated, given.frame)
+    with pytest.raises(UsageError, match="only method adjusted or filtered"):
+        methods.estimate(replace(named, survey=replace(named.survey, method="ins")), quiet)
     inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
     assert np.sqrt(np.mean(np.square(found.position[inside]))) < 0.06
 
