@@ -18,6 +18,7 @@ change_false_per_100m2    claims that are none, there
 (those of uses_closeups.py)  tall grass, the edge of a wood, a road, from 4 m
 (those of uses_change.py)  what moved between two flights
 (those of uses_ground.py)  soil, moving things, panes, pipes, passability
+(those of uses_places.py)  ground of made-up places of other kinds
 sight_exact_agreement     share of cells of 200 random surfaces where `exact` says what a dense walk along the line says
 sight_fast_agreement      share of cells of a terrain of a million cells where `fast` says what `exact` says
 sight_fast_ratio_to_gdal  CPU time of `fast` over that of GDAL, for it
@@ -43,6 +44,7 @@ import uses_change
 import uses_closeups
 import uses_clouds
 import uses_ground
+import uses_places
 from scipy.ndimage import gaussian_filter
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -303,6 +305,7 @@ FIGURES: Final[dict[str, Callable[[], Figures]]] = {
     **uses_closeups.FIGURES,
     **uses_clouds.FIGURES,
     **uses_ground.FIGURES,
+    **uses_places.FIGURES,
 }
 
 if __name__ == "__main__":
