@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from flightlog import frames
+from groundproc.estimation.adjustment.adjusted import own_part
 from groundproc.estimation.adjustment.bridging import (
     KEPT,
     SHORTEST,
@@ -209,3 +210,26 @@ def test_of_a_flight_of_four_seconds_half_of_what_counts_is_long_enough(blind: i
     track = seen(38, 0.01, 0.01, matched=500)
     track.matched[START : START + blind] = [0] * blind
     assert holds_somewhere(track) is kept
+
+
+@pytest.mark.parametrize(
+    ("runs", "number", "first_s", "last_s"),
+    [
+        ({0: 50.0}, 0, 0.0, SECONDS),  # before the lidar's first return and after its last too
+        ({0: 25.0, 2: 50.0}, 0, 0.0, 25.0),
+        ({0: 25.0, 2: 50.0}, 2, 25.0, SECONDS),
+    ],
+)
+def test_what_is_handed_back_of_a_run_is_all_of_it(
+    runs: dict[int, float], number: int, first_s: float, last_s: float
+) -> None:
+    start = flown()
+    placed: Any = [
+        SimpleNamespace(run=run, last_lidar_ns=START_NS + int(end_s * 1e9), utc_from_lidar=lambda time_ns: time_ns)
+        for run, end_s in runs.items()
+    ]
+    part = own_part(start, placed, number)
+    seconds = (part.time_ns - START_NS) * 1e-9
+    step_s = STEP_NS * 1e-9
+    assert seconds[0] == pytest.approx(first_s, abs=1.5 * step_s)
+    assert seconds[-1] == pytest.approx(last_s, abs=1.5 * step_s)
