@@ -79,28 +79,27 @@ def mean_normals(place_m: Array, normal: Array, tilt: Array, cell_m: float) -> t
 @njit(cache=True, nogil=True)
 def _sort_by_way(rows: Ints, normal: Array, tilt: Array, way: Ints, ways: Ways) -> None:
     """Way that each of some planes faces, -1 where there are too many, and the sums of each way."""
-    known = 0
+    known, sums = 0, ways.normal
     for i in rows:
-        n, best, nearest = normal[i], -1, ONE_WAY
+        nx, ny, nz, best, nearest = normal[i, 0], normal[i, 1], normal[i, 2], -1, ONE_WAY
         for k in range(known):
-            t = ways.normal[k]
-            lean = abs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]) / np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
+            x, y, z = sums[k, 0], sums[k, 1], sums[k, 2]
+            lean = abs(nx * x + ny * y + nz * z) / np.sqrt(x**2 + y**2 + z**2)
             if lean > nearest:
                 best, nearest = k, lean
         if best < 0 and known < MOST_WAYS:
             best, known = known, known + 1
-            ways.planes[best], ways.tilt[best], ways.normal[best], ways.square[best] = 0.0, 0.0, 0.0, 0.0
+            ways.planes[best], ways.tilt[best], sums[best], ways.square[best] = 0.0, 0.0, 0.0, 0.0
         way[i] = best
         if best < 0:
             continue
-        t = ways.normal[best]
-        side = 1.0 if n[0] * t[0] + n[1] * t[1] + n[2] * t[2] >= 0.0 else -1.0
+        side = 1.0 if nx * sums[best, 0] + ny * sums[best, 1] + nz * sums[best, 2] >= 0.0 else -1.0
         ways.planes[best] += 1.0
         ways.tilt[best] += tilt[i]
         for a in range(3):
-            t[a] += side * n[a]
+            sums[best, a] += side * normal[i, a]
             for b in range(3):
-                ways.square[best, a, b] += n[a] * n[b]
+                ways.square[best, a, b] += normal[i, a] * normal[i, b]
 
 
 @njit(cache=True, nogil=True)

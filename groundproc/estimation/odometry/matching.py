@@ -155,12 +155,13 @@ def _nothing() -> Normal:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _row(mat: Array, body: Array, nx: float, ny: float, nz: float, out: Array) -> None:
+def _row(mat: Array, body: tuple[float, float, float], nx: float, ny: float, nz: float, out: Array) -> None:
     """How a distance along a normal changes with the pose of the slice's end: by rotation in the body, and by position."""
+    bx, by, bz = body
     p = nx * mat[0, 0] + ny * mat[1, 0] + nz * mat[2, 0]
     q = nx * mat[0, 1] + ny * mat[1, 1] + nz * mat[2, 1]
     r = nx * mat[0, 2] + ny * mat[1, 2] + nz * mat[2, 2]
-    out[0], out[1], out[2] = body[1] * r - body[2] * q, body[2] * p - body[0] * r, body[0] * q - body[1] * p
+    out[0], out[1], out[2] = by * r - bz * q, bz * p - bx * r, bx * q - by * p
     out[3], out[4], out[5] = nx, ny, nz
 
 
@@ -195,62 +196,67 @@ def _match(
         x = mat[0, 0] * bx + mat[0, 1] * by + mat[0, 2] * bz + position[0]
         y = mat[1, 0] * bx + mat[1, 1] * by + mat[1, 2] * bz + position[1]
         z = mat[2, 0] * bx + mat[2, 1] * by + mat[2, 2] * bz + position[2]
-        row[n] = find(table, keys, voxel_key(x, y, z, per_m))
-        if row[n] < 0:
+        v = find(table, keys, voxel_key(x, y, z, per_m))
+        row[n] = v
+        if v < 0:
             continue
-        v = voxels[row[n]]
-        if v[SPREAD] > 0.0:
+        if voxels[v, SPREAD] > 0.0:
             matched += 1
             continue
-        e = v[NORMAL] * x + v[NORMAL + 1] * y + v[NORMAL + 2] * z - v[LEVEL]
-        if v[FLATNESS] < 0.0 or abs(e) > gate_m:
+        e = voxels[v, NORMAL] * x + voxels[v, NORMAL + 1] * y + voxels[v, NORMAL + 2] * z - voxels[v, LEVEL]
+        if voxels[v, FLATNESS] < 0.0 or abs(e) > gate_m:
             row[n] = -1
             continue
         # a plane known from a few lines is uncertain away from them
-        off = (x - v[MEAN]) ** 2 + (y - v[MEAN + 1]) ** 2 + (z - v[MEAN + 2]) ** 2
-        lean = abs(v[NORMAL] * up[0] + v[NORMAL + 1] * up[1] + v[NORMAL + 2] * up[2])
-        if STANDING < lean <= cone and _may_be_ground(v, lean):
+        off = (x - voxels[v, MEAN]) ** 2 + (y - voxels[v, MEAN + 1]) ** 2 + (z - voxels[v, MEAN + 2]) ** 2
+        lean = abs(voxels[v, NORMAL] * up[0] + voxels[v, NORMAL + 1] * up[1] + voxels[v, NORMAL + 2] * up[2])
+        if STANDING < lean <= cone and _may_be_ground(voxels[v, COUNT], voxels[v, TILT], lean):
             row[n] = -1
             continue
-        variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * v[FLATNESS] + v[TILT] * off
+        variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * voxels[v, FLATNESS] + voxels[v, TILT] * off
         weight[n] = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
         residual[n] = e
         matched += 1
         if lean > cone:
-            side = v[NORMAL] * up[0] + v[NORMAL + 1] * up[1] + v[NORMAL + 2] * up[2]
+            side = voxels[v, NORMAL] * up[0] + voxels[v, NORMAL + 1] * up[1] + voxels[v, NORMAL + 2] * up[2]
             signed = weight[n] if side > 0.0 else -weight[n]
             for c in range(3):
-                total[c] += signed * v[NORMAL + c]
+                total[c] += signed * voxels[v, NORMAL + c]
     return matched
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _may_be_ground(v: Array, lean: float) -> bool:
+def _may_be_ground(count: float, tilt: float, lean: float) -> bool:
     """Whether a plane leans from the ground, by its cosine, by no more than returns of one or two rings would: they share their errors."""
-    of_one_ring = 0.25 * min(v[COUNT], MOST_RETURNS) * v[TILT]
+    of_one_ring = 0.25 * min(count, MOST_RETURNS) * tilt
     return bool(1.0 - lean * lean < SURE_LEAN**2 * of_one_ring)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_filled(v: Array, mat: Array, body: Array, off: Array, count: int, voxel_m: float, normal: Normal) -> None:
-    """Three rows along the axes of what fills a voxel.
+def _add_filled(
+    voxels: Array, v: int, mat: Array, body: tuple[float, float, float], off: Array, count: int, voxel_m: float, sums: Sums,
+    memory: tuple[Array, Array],
+) -> None:  # fmt: skip
+    """Three rows along the axes of what fills a voxel, by its row in the map, to all that is not ground; working memory (6,), (3, 3).
 
     The mean of a few returns lies about that of the voxel by its spread. What is cut off by the voxel's faces does not move them with
     the path: evenly filled from face to face, a spread of edge / sqrt(12), it tells nothing.
     """
-    j, axis = np.empty(6), np.empty((3, 3))
-    axis[0, :], axis[2, :] = v[NORMAL : NORMAL + 3], v[LONGEST : LONGEST + 3]
+    j, axis = memory
+    for c in range(3):
+        axis[0, c], axis[2, c] = voxels[v, NORMAL + c], voxels[v, LONGEST + c]
     axis[1, 0] = axis[2, 1] * axis[0, 2] - axis[2, 2] * axis[0, 1]
     axis[1, 1] = axis[2, 2] * axis[0, 0] - axis[2, 0] * axis[0, 2]
     axis[1, 2] = axis[2, 0] * axis[0, 1] - axis[2, 1] * axis[0, 0]
     for i in range(3):
-        spread = v[SPREAD + i]
+        spread = voxels[v, SPREAD + i]
         moves = max(1.0 - 12.0 * spread / voxel_m**2, 0.0)
         e = axis[i, 0] * off[0] + axis[i, 1] * off[1] + axis[i, 2] * off[2]
         variance = spread / min(count, FILLED_RETURNS) + FILLED_SIGMA_M**2
         weight = moves * min(1.0, 3.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
         _row(mat, body, axis[i, 0], axis[i, 1], axis[i, 2], j)
-        _add(j, weight, e, normal)
+        _add(j, weight, e, sums.rest)
+        _add(j, weight, e, sums.facing)
 
 
 @njit(cache=True, nogil=True)
@@ -258,10 +264,10 @@ def _accumulate(
     planes: MapArrays, clusters: _Clusters, pose: tuple[Array, Array], found: _Matches, ground: Array, sums: Sums
 ) -> float:
     """Normal equations of all matches, those on the ground by its mean normal and by their own apart; gives the sum of squares."""
-    voxels, body = planes.voxels, clusters.body_m
+    voxels, body, returns = planes.voxels, clusters.body_m, clusters.returns
     mat, position = pose
     row, residual, weight = found
-    j, off = np.empty(6), np.empty(3)
+    j, off, axis, by, some = np.empty(6), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty(6)
     mean, unsure = _facing(planes, row, ground)
     squares = 0.0
     for each in (sums.rest, sums.level, sums.ground, sums.facing):
@@ -269,27 +275,26 @@ def _accumulate(
     for n in range(len(body)):
         if row[n] < 0:
             continue
-        v, e = voxels[row[n]], residual[n]
-        if v[FLATNESS] < 0.0:
+        v, e, b = row[n], residual[n], (body[n, 0], body[n, 1], body[n, 2])
+        if voxels[v, FLATNESS] < 0.0:
             for c in range(3):
                 off[c] = (
-                    mat[c, 0] * body[n, 0] + mat[c, 1] * body[n, 1] + mat[c, 2] * body[n, 2] + position[c] - v[MEAN + c]
+                    mat[c, 0] * b[0] + mat[c, 1] * b[1] + mat[c, 2] * b[2] + position[c] - voxels[v, MEAN + c]
                 )
-            _add_filled(v, mat, body[n], off, clusters.returns[n], planes.voxel_m, sums.rest)
-            _add_filled(v, mat, body[n], off, clusters.returns[n], planes.voxel_m, sums.facing)
+            _add_filled(voxels, v, mat, b, off, returns[n], planes.voxel_m, sums, (j, axis))
             continue
         squares += e * e
-        _row(mat, body[n], v[NORMAL], v[NORMAL + 1], v[NORMAL + 2], j)
-        lean = v[NORMAL] * ground[0] + v[NORMAL + 1] * ground[1] + v[NORMAL + 2] * ground[2]
+        _row(mat, b, voxels[v, NORMAL], voxels[v, NORMAL + 1], voxels[v, NORMAL + 2], j)
+        lean = voxels[v, NORMAL] * ground[0] + voxels[v, NORMAL + 1] * ground[1] + voxels[v, NORMAL + 2] * ground[2]
         if abs(lean) <= GROUND:
             _add(j, weight[n], e, sums.rest)
-            _row(mat, body[n], mean[n, 0], mean[n, 1], mean[n, 2], j)
+            _row(mat, b, mean[n, 0], mean[n, 1], mean[n, 2], j)
             _add(j, weight[n], e, sums.facing)
-            _take_off(mat, body[n], unsure[n], weight[n], sums.facing)
+            _take_off(mat, b, (unsure, n), weight[n], sums.facing, (by, some))
             continue
         _add(j, weight[n], e, sums.ground)
         side = 1.0 if lean > 0.0 else -1.0
-        _row(mat, body[n], side * ground[0], side * ground[1], side * ground[2], j)
+        _row(mat, b, side * ground[0], side * ground[1], side * ground[2], j)
         _add(j, weight[n], e, sums.level)
     for each in (sums.rest, sums.level, sums.ground, sums.facing):
         for a in range(6):
@@ -308,31 +313,46 @@ def _facing(planes: MapArrays, row: Ints, ground: Array) -> tuple[Array, Array]:
     at = np.empty(len(row), np.int64)
     place, normal = np.empty((len(row), 3)), np.empty((len(row), 3))
     for n in range(len(row)):
-        if row[n] < 0 or voxels[row[n], FLATNESS] < 0.0:
+        v = row[n]
+        if v < 0 or voxels[v, FLATNESS] < 0.0:
             continue
-        v = voxels[row[n]]
-        if abs(v[NORMAL] * ground[0] + v[NORMAL + 1] * ground[1] + v[NORMAL + 2] * ground[2]) > GROUND:
+        if abs(voxels[v, NORMAL] * ground[0] + voxels[v, NORMAL + 1] * ground[1] + voxels[v, NORMAL + 2] * ground[2]) > GROUND:
             continue
         at[count] = n
-        place[count], normal[count] = v[MEAN : MEAN + 3], v[NORMAL : NORMAL + 3]
+        for c in range(3):
+            place[count, c], normal[count, c] = voxels[v, MEAN + c], voxels[v, NORMAL + c]
         count += 1
     # fewer than three planes are no wall: with their stated tilts taken off, a meadow's trunks and tufts would tell nothing
     found = mean_normals(place[:count], normal[:count], np.zeros(count), FACING_VOXELS * planes.voxel_m)
     mean, covariance = np.zeros((len(row), 3)), np.zeros((len(row), 3, 3))
     for i in range(count):
-        mean[at[i]], covariance[at[i]] = found[0][i], found[1][i]
+        for a in range(3):
+            mean[at[i], a] = found[0][i, a]
+            for b in range(3):
+                covariance[at[i], a, b] = found[1][i, a, b]
     return mean, covariance
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _take_off(mat: Array, body: Array, covariance: Array, weight: float, normal: Normal) -> None:
-    """Take off the lower half of the information what an error of the normal adds to it by chance: weight J C J^T."""
-    by, some = np.empty((3, 6)), np.empty(6)
+def _take_off(
+    mat: Array, body: tuple[float, float, float], covariances: tuple[Array, int], weight: float, normal: Normal,
+    memory: tuple[Array, Array],
+) -> None:  # fmt: skip
+    """Take off the lower half of the information what an error of the normal adds to it by chance: weight J C J^T.
+
+    C is one of some covariances, by its number; working memory (3, 6), (6,).
+    """
+    (covariance, n), (by, some) = covariances, memory
+    bx, b_y, bz = body
+    # by rotation in the body and by position, for normals along the three axes
     for c in range(3):
-        _row(mat, body, 1.0 if c == 0 else 0.0, 1.0 if c == 1 else 0.0, 1.0 if c == 2 else 0.0, by[c])
+        p, q, r = mat[c, 0], mat[c, 1], mat[c, 2]
+        by[c, 0], by[c, 1], by[c, 2] = b_y * r - bz * q, bz * p - bx * r, bx * q - b_y * p
+        by[c, 3], by[c, 4], by[c, 5] = 0.0, 0.0, 0.0
+        by[c, 3 + c] = 1.0
     for c in range(3):
         for a in range(6):
-            some[a] = covariance[c, 0] * by[0, a] + covariance[c, 1] * by[1, a] + covariance[c, 2] * by[2, a]
+            some[a] = covariance[n, c, 0] * by[0, a] + covariance[n, c, 1] * by[1, a] + covariance[n, c, 2] * by[2, a]
         for a in range(6):
             for b in range(a + 1):
                 normal.information[a, b] -= weight * by[c, a] * some[b]
