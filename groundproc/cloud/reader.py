@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -92,6 +92,9 @@ class Chunk:
     record: Any
 
 
+Picked = Callable[[int, int], npt.NDArray[np.bool_]]
+
+
 def look(path: Path, *choices: Choice) -> Cloud:
     """Read a header.
 
@@ -122,8 +125,9 @@ def look(path: Path, *choices: Choice) -> Cloud:
 
 
 def chunks(
-    cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None, selection: Selection | None = None
-) -> Iterator[Chunk]:
+    cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None, selection: Selection | None = None,
+    picked: Picked | None = None,
+) -> Iterator[Chunk]:  # fmt: skip
     """All points of a file that are wanted; no piece is empty where some are not.
 
     Parameters
@@ -135,6 +139,8 @@ def chunks(
         Those wanted, of `cloud.columns`; default: all.
     selection : Selection, optional
         Counts what is left out; default: one of the cloud's own choices, whose counts nobody sees.
+    picked : callable, optional
+        Given the number of a piece's first point and how many it has: a mask of those that are wanted at all. Only they are unfolded.
 
     Raises
     ------
@@ -149,7 +155,9 @@ def chunks(
     with opened(cloud.path) as reader:
         seen = 0
         for record in _records(cloud.path, reader):
-            seen += len(record)
+            begin, seen = seen, seen + len(record)
+            if picked is not None:
+                record = _of(record, picked(begin, len(record)))
             time_ns = np.zeros(len(record), np.int64)
             if clock is not None:
                 time_s = np.asarray(record.gps_time, np.float64)
@@ -163,6 +171,13 @@ def chunks(
                 yield Chunk(_only(points, asked), record)
         if seen != cloud.points:
             raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
+
+
+def _of(record: Any, wanted: npt.NDArray[np.bool_]) -> Any:
+    """Some of some records, copied as bytes: numpy copies structures field by field."""
+    array = record.array
+    some = array.view(f"V{array.dtype.itemsize}").take(np.flatnonzero(wanted)).view(array.dtype)
+    return laspy.ScaleAwarePointRecord(some, record.point_format, record.scales, record.offsets)
 
 
 def _only(points: Points, names: Collection[str]) -> Points:

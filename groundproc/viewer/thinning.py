@@ -21,6 +21,9 @@ _READ: Final = (2, 4)
 _CLOSE: Final = 0.97
 """Share of the wanted points that is enough."""
 _TRIALS: Final = 12
+_SURFACE: Final = 2.0
+_POWERS: Final = (0.5, 3.0)
+"""Cells on a surface: their number goes with the square of their size; but where most have one point by then, with less. Two trials tell."""
 _MORE: Final = 1_000
 """Room for what a share of many nodes comes to beyond the share of all."""
 _TIME: Final = "time"
@@ -92,6 +95,7 @@ def thinner(points: Thinned, most: int) -> Thinned:
     local = points.xyz_m - points.xyz_m.min(axis=0)
     voxel_m = max(high / np.sqrt(most), points.spacing_m)
     best: tuple[npt.NDArray[Any], float] | None = None
+    last, power = None, _SURFACE
     for _ in range(_TRIALS):
         voxel, found = assign(local, voxel_m)
         if found > most:
@@ -102,8 +106,10 @@ def thinner(points: Thinned, most: int) -> Thinned:
             best = np.flatnonzero(np.diff(np.maximum.accumulate(voxel), prepend=-1) > 0), voxel_m
             if found >= _CLOSE * most:
                 break
-        # cells on a surface: their number goes with the square of their size
-        guess = voxel_m * np.sqrt(found / (0.985 * most))
+        if last is not None and found != last[1]:
+            power = float(np.clip(np.log(found / last[1]) / np.log(last[0] / voxel_m), *_POWERS))
+        last = voxel_m, found
+        guess = voxel_m * (found / (0.985 * most)) ** (1.0 / power)
         voxel_m = guess if low < guess < high else (low + high) / 2.0
     if best is None:
         best = np.flatnonzero(_share(len(points), most / len(points))), high
@@ -137,10 +143,8 @@ def _of_octree(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iter
 
 def _of_file(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterator[Thinned]:
     """All points in their order, or an even share of them."""
-    share, seen = min(most / cloud.points, 1.0), 0
-    for chunk in reader.chunks(cloud, columns=columns):
-        chosen = _share(len(chunk.points), share, seen) if share < 1.0 else np.ones(len(chunk.points), bool)
-        seen += len(chunk.points)
-        time_s = np.asarray(chunk.record.gps_time, np.float64)[chosen] if cloud.timed else None
-        picked = {name: values[chosen] for name, values in chunk.points.columns.items()}
-        yield Thinned(chunk.points.xyz_m[chosen], picked, time_s, 0.0)
+    share = min(most / cloud.points, 1.0)
+    picked = (lambda begin, count: _share(count, share, begin)) if share < 1.0 else None
+    for chunk in reader.chunks(cloud, columns=columns, picked=picked):
+        time_s = np.asarray(chunk.record.gps_time, np.float64) if cloud.timed else None
+        yield Thinned(chunk.points.xyz_m, dict(chunk.points.columns), time_s, 0.0)
