@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -29,6 +30,9 @@ _CHUNK_SIZE_AT: Final = 12
 """Where the record of the packing states the points of a chunk (LASzip VLR)."""
 
 
+Parts = Sequence[tuple[int, int]]
+
+
 class Backend:
     """What laspy takes for a library that unpacks.
 
@@ -37,10 +41,12 @@ class Backend:
     path : Path
     most : int
         Points that are asked for at once; always so many but at the end.
+    parts : sequence of (int, int), optional
+        First point and number of points of each part that is read, in this order and not beyond `most`; default: all points.
     """
 
-    def __init__(self, path: Path, most: int) -> None:
-        self._path, self._most = path, most
+    def __init__(self, path: Path, most: int, parts: Parts | None = None) -> None:
+        self._path, self._most, self._parts = path, most, parts
 
     def is_available(self) -> bool:
         """It is."""
@@ -49,7 +55,7 @@ class Backend:
     def create_reader(self, source: Any, header: Any, decompression_selection: Any = None) -> "Unpacker":
         """A reader of the points of a file that laspy has opened."""
         vlr = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
-        return Unpacker(self._path, source, header, vlr, self._most)
+        return Unpacker(self._path, source, header, vlr, self._most, self._parts)
 
 
 class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
@@ -65,16 +71,20 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
         How the points are packed.
     most : int
         Points at once.
+    parts : sequence of (int, int), optional
+        As in `Backend`.
     """
 
-    def __init__(self, path: Path, source: Any, header: Any, vlr: bytes, most: int) -> None:
+    def __init__(self, path: Path, source: Any, header: Any, vlr: bytes, most: int, parts: Parts | None = None) -> None:
         self._source = source
         self._point_bytes = int(header.point_format.size)
         if (stated := int(lazrs.LazVlr(vlr).item_size())) != self._point_bytes:
             raise LaspyException(f"points of {stated} bytes are packed, expected {self._point_bytes} by the header")
-        self._left, self._most = int(header.point_count), most
-        self._half, self._asked = 0, 0
-        half_bytes = min(self._left, most) * self._point_bytes
+        count = int(header.point_count)
+        self._seeks = parts is not None
+        self._parts = iter(((at, min(most, count - at)) for at in range(0, count, most)) if parts is None else parts)
+        self._half, self._first, self._asked = 0, 0, 0
+        half_bytes = min(count, most) * self._point_bytes
         self._half_bytes = half_bytes + -half_bytes % mmap.ALLOCATIONGRANULARITY
         chunk_points = int.from_bytes(vlr[_CHUNK_SIZE_AT : _CHUNK_SIZE_AT + 4], "little")
         parallel = chunk_points == _VARIABLE or chunk_points * self._point_bytes <= _CHUNK_BYTES
@@ -107,13 +117,18 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
             raise LaspyException(f"{n} points are wanted, expected {self._asked}")
         self._wait()
         begin = self._half * self._half_bytes
-        self._half, self._left = 1 - self._half, self._left - n
+        self._half = 1 - self._half
         self._ask()
         return bytearray(memoryview(self._memory)[begin : begin + n * self._point_bytes])
 
     def seek(self, point_index: int) -> None:
-        """Not possible: points come in their order."""
-        raise LaspyException("points can only be read in their order")
+        """Only to where the next part begins."""
+        if not self._asked:
+            self._ask()
+        if point_index != self._first:
+            raise LaspyException(
+                f"point {point_index} is wanted, expected {self._first}: points can only be read in their order"
+            )
 
     def close(self) -> None:
         """End the other process, whatever it does, and close the file."""
@@ -124,10 +139,11 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
 
     def _ask(self) -> None:
         """Let the next points be unpacked."""
-        self._asked = min(self._left, self._most)
+        self._first, self._asked = next(self._parts, (0, 0))
         if self._asked:
+            first = f" {self._first}" if self._seeks else ""
             try:
-                _pipe(self._child.stdin).write(f"{self._half} {self._asked}\n")
+                _pipe(self._child.stdin).write(f"{self._half} {self._asked}{first}\n")
                 _pipe(self._child.stdin).flush()
             except BrokenPipeError:  # it is gone: `_wait` says why
                 pass

@@ -2,8 +2,9 @@
 
 Run as a script by `groundproc.cloud.laz`, with the folder of the packages and a JSON object of `Task`'s fields as arguments, and nothing
 imported but lazrs: it starts in 30 ms. It shares a memory of two halves with the process that started it. Each line of the standard input,
-`HALF COUNT`, asks for the next so many points in one of the halves; `HALF COUNT PLACE SIZE` for all points of the one chunk that has so
-many bytes from there on in the file. `ok` on the standard output says that they are there, and any other line is an error.
+`HALF COUNT`, asks for the next so many points in one of the halves; `HALF COUNT FIRST` for those from point `FIRST` on; `HALF COUNT PLACE
+SIZE` for all points of the one chunk that has so many bytes from there on in the file. `ok` on the standard output says that they are
+there, and any other line is an error.
 """
 
 import json
@@ -71,16 +72,18 @@ def _unpack(task: Task) -> None:
         file.seek(task.offset)
         unpacker: Any = None
         for line in sys.stdin:
-            half, count, *chunk = map(int, line.split())
+            half, count, *where = map(int, line.split())
             _allow(count)
             begin = half * task.half_bytes
             with memoryview(shared) as whole, whole[begin : begin + count * task.point_bytes] as place:
-                if chunk:
-                    file.seek(chunk[0])
-                    packed = file.read(chunk[1])
+                if len(where) == 2:
+                    file.seek(where[0])
+                    packed = file.read(where[1])
                     lazrs.decompress_points_with_chunk_table(packed, packing, place, [(count, len(packed))])
                 else:
                     unpacker = unpacker or kind(file, packing)
+                    if where:
+                        unpacker.seek(where[0])
                     unpacker.decompress_many(place)
             _answer("ok")
 

@@ -147,9 +147,27 @@ def _sigmas(xyz: Any, origin: Any, step: Any, errors: _Steps, incidence_deg: Any
         s = step[i]
         x, y, z = xyz[i, 0] - ins[s, 0], xyz[i, 1] - ins[s, 1], xyz[i, 2] - ins[s, 2]
         # a turn w moves the point by w x r: east by w1 z - w2 y, north by w2 x - w0 z, up by w0 y - w1 x
-        east = place[s, 0, 0] + 2.0 * (both[s, 0, 1] * z - both[s, 0, 2] * y) + turn[s, 1, 1] * z * z + turn[s, 2, 2] * y * y - 2.0 * turn[s, 1, 2] * y * z
-        north = place[s, 1, 1] + 2.0 * (both[s, 1, 2] * x - both[s, 1, 0] * z) + turn[s, 2, 2] * x * x + turn[s, 0, 0] * z * z - 2.0 * turn[s, 0, 2] * x * z
-        up = place[s, 2, 2] + 2.0 * (both[s, 2, 0] * y - both[s, 2, 1] * x) + turn[s, 0, 0] * y * y + turn[s, 1, 1] * x * x - 2.0 * turn[s, 0, 1] * x * y
+        east = (
+            place[s, 0, 0]
+            + 2.0 * (both[s, 0, 1] * z - both[s, 0, 2] * y)
+            + turn[s, 1, 1] * z * z
+            + turn[s, 2, 2] * y * y
+            - 2.0 * turn[s, 1, 2] * y * z
+        )
+        north = (
+            place[s, 1, 1]
+            + 2.0 * (both[s, 1, 2] * x - both[s, 1, 0] * z)
+            + turn[s, 2, 2] * x * x
+            + turn[s, 0, 0] * z * z
+            - 2.0 * turn[s, 0, 2] * x * z
+        )
+        up = (
+            place[s, 2, 2]
+            + 2.0 * (both[s, 2, 0] * y - both[s, 2, 1] * x)
+            + turn[s, 0, 0] * y * y
+            + turn[s, 1, 1] * x * x
+            - 2.0 * turn[s, 0, 1] * x * y
+        )
         x, y, z = xyz[i, 0] - origin[i, 0], xyz[i, 1] - origin[i, 1], xyz[i, 2] - origin[i, 2]
         square = x * x + y * y + z * z
         slant = np.float64(incidence_deg[i]) if told else np.nan

@@ -126,7 +126,7 @@ def look(path: Path, *choices: Choice) -> Cloud:
 
 def chunks(
     cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None, selection: Selection | None = None,
-    picked: Picked | None = None,
+    picked: Picked | None = None, parts: laz.Parts | None = None,
 ) -> Iterator[Chunk]:  # fmt: skip
     """All points of a file that are wanted; no piece is empty where some are not.
 
@@ -141,6 +141,8 @@ def chunks(
         Counts what is left out; default: one of the cloud's own choices, whose counts nobody sees.
     picked : callable, optional
         Given the number of a piece's first point and how many it has: a mask of those that are wanted at all. Only they are unfolded.
+    parts : sequence of (int, int), optional
+        First point and number of points, at most `CHUNK`, of each part of the file that is read at all, in this order.
 
     Raises
     ------
@@ -152,9 +154,9 @@ def chunks(
     selection = Selection(cloud.choices) if selection is None else selection
     asked = cloud.columns if columns is None else columns
     needed = {*asked, *(name for each in selection.choices for name in each.columns)}
-    with opened(cloud.path) as reader:
+    with opened(cloud.path, parts) as reader:
         seen = 0
-        for record in _records(cloud.path, reader):
+        for record in _records(cloud.path, reader, parts):
             begin, seen = seen, seen + len(record)
             if picked is not None:
                 record = _of(record, picked(begin, len(record)))
@@ -169,8 +171,9 @@ def chunks(
                 points, record = points.masked(wanted), record[wanted]
             if len(points) or not selection.choices:
                 yield Chunk(_only(points, asked), record)
-        if seen != cloud.points:
-            raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {cloud.points} by its header")
+        expected = cloud.points if parts is None else sum(count for _, count in parts)
+        if seen != expected:
+            raise CaptureError(f"{cloud.path}: ends after {seen} points, expected {expected} by its header")
 
 
 def _of(record: Any, wanted: npt.NDArray[np.bool_]) -> Any:
@@ -266,8 +269,8 @@ def _column(entry: Dimension, record: Any) -> npt.NDArray[Any]:
     return np.asarray(values, entry.column)
 
 
-def _records(path: Path, reader: Any) -> Iterator[Any]:
-    points = reader.chunk_iterator(_at_once(reader.header))
+def _records(path: Path, reader: Any, parts: laz.Parts | None = None) -> Iterator[Any]:
+    points = reader.chunk_iterator(_at_once(reader.header)) if parts is None else _of_parts(reader, parts)
     while True:
         try:
             record = next(points)
@@ -278,14 +281,20 @@ def _records(path: Path, reader: Any) -> Iterator[Any]:
         yield record
 
 
+def _of_parts(reader: Any, parts: laz.Parts) -> Iterator[Any]:
+    for first, count in parts:
+        reader.seek(first)
+        yield reader.read_points(count)
+
+
 def _at_once(header: Any) -> int:
     """Points that are read at once."""
     return min(CHUNK, max(1, _CHUNK_BYTES // int(header.point_format.size)))
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Any]:
-    """A file, read by laspy.
+def opened(path: Path, parts: laz.Parts | None = None) -> Iterator[Any]:
+    """A file, read by laspy; `parts` of it as in `chunks`.
 
     Raises
     ------
@@ -296,7 +305,7 @@ def opened(path: Path) -> Iterator[Any]:
         lashead.check(path)
         reader = laspy.open(path)
         if system.LIMITED:  # else in this process: what aborts takes all of it
-            reader.laz_backend = laz.Backend(path, _at_once(reader.header))
+            reader.laz_backend = laz.Backend(path, _at_once(reader.header), parts)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from None
     except DAMAGE as error:

@@ -58,7 +58,7 @@ def read(folder: Path, most: int) -> CloudPart | None:
     if path is None:
         return None
     cloud = reader.look(path)
-    points = thin(cloud, most)
+    points = thin(cloud, most, in_time=True)
     return CloudPart(points, shades_of(points.columns, _since(points)), cloud.points, cloud.crs)
 
 

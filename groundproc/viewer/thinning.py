@@ -18,12 +18,14 @@ Array = npt.NDArray[np.float64]
 
 _READ: Final = (2, 4)
 """Times as many points are looked at as are kept: of an octree, whose levels are even already, and of a file in the order of time."""
+_STRETCH: Final = 100_000
+"""Points of a flight that are read on end: two of the pieces that LAZ packs by themselves, so that two cores unpack them."""
 _CLOSE: Final = 0.97
 """Share of the wanted points that is enough."""
 _TRIALS: Final = 12
 _SURFACE: Final = 2.0
 _POWERS: Final = (0.5, 3.0)
-"""Cells on a surface: their number goes with the square of their size; but where most have one point by then, with less. Two trials tell."""
+"""Cells on a surface: their number goes with the square of their size; where most have one point by then, with less. Two trials tell."""
 _MORE: Final = 1_000
 """Room for what a share of many nodes comes to beyond the share of all."""
 _TIME: Final = "time"
@@ -60,8 +62,18 @@ class Thinned:
         return Thinned(self.xyz_m[chosen], columns, None if self.time_s is None else self.time_s[chosen], spacing_m)
 
 
-def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None) -> Thinned:
+def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None, in_time: bool = False) -> Thinned:
     """At most so many points, spread as evenly as voxels of one size can; the same ones every time.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    most : int
+    columns : collection of str, optional
+        Default: all.
+    in_time : bool
+        The points are known to be those of one flight in the order of time. Then stretches of it are read whole, and others not at all:
+        a sensor that turns sees each place for seconds, of which stretches of 0.3 s are a fair sample, and unpacking costs the most.
 
     Raises
     ------
@@ -73,7 +85,8 @@ def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None) -> Thi
     held: dict[str, npt.NDArray[Any]] = {}
     used = 0
     # filled piece by piece: pieces and their sum together would be twice the memory
-    with contextlib.closing(ahead((_of_octree if octree else _of_file)(cloud, room, columns))) as parts:
+    source = _of_octree if octree else _of_flight if in_time else _of_file
+    with contextlib.closing(ahead(source(cloud, room, columns))) as parts:
         for part in parts:
             arrays = {"": part.xyz_m, **part.columns} | ({} if part.time_s is None else {_TIME: part.time_s})
             count = min(len(part), room + _MORE - used)
@@ -146,5 +159,19 @@ def _of_file(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterat
     share = min(most / cloud.points, 1.0)
     picked = (lambda begin, count: _share(count, share, begin)) if share < 1.0 else None
     for chunk in reader.chunks(cloud, columns=columns, picked=picked):
-        time_s = np.asarray(chunk.record.gps_time, np.float64) if cloud.timed else None
-        yield Thinned(chunk.points.xyz_m, dict(chunk.points.columns), time_s, 0.0)
+        yield _whole(cloud, chunk)
+
+
+def _of_flight(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterator[Thinned]:
+    """Stretches of a flight, as many as make up so many points, evenly over its time."""
+    begins = range(0, cloud.points, _STRETCH)
+    count = min(max(most // _STRETCH, 1), len(begins))
+    chosen = [begins[i * len(begins) // count] for i in range(count)]
+    parts = [(begin, min(_STRETCH, cloud.points - begin)) for begin in chosen]
+    for chunk in reader.chunks(cloud, columns=columns, parts=parts):
+        yield _whole(cloud, chunk)
+
+
+def _whole(cloud: Cloud, chunk: reader.Chunk) -> Thinned:
+    time_s = np.asarray(chunk.record.gps_time, np.float64) if cloud.timed else None
+    return Thinned(chunk.points.xyz_m, dict(chunk.points.columns), time_s, 0.0)

@@ -136,17 +136,14 @@ def _add(
     table, keys, voxels, voxel_m = planes
     diagonal, beside, pull = system
     before, after, mat, place, j = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    known = -1
     for n in range(len(time_ns)):
         g = (time_ns[n] - path.start_ns) / path.step_ns
         i = int(g)
         if g < 0.0 or i >= len(path.quat) - 1:
             continue
         share = g - i
-        if i != known:
-            known = i
-            mat_of_quat(path.quat[i], before)
-            mat_of_quat(path.quat[i + 1], after)
+        mat_of_quat(path.quat[i], before)
+        mat_of_quat(path.quat[i + 1], after)
         for r in range(3):
             place[r] = path.position_m[i, r] + share * (path.position_m[i + 1, r] - path.position_m[i, r])
             for c in range(3):
@@ -161,7 +158,9 @@ def _add(
             away += (place[c] - voxels[row, MEAN + c]) ** 2
         if abs(off) > GATE_M:
             continue
-        variance = max(RANGE_SIGMA_M**2, voxels[row, FLATNESS]) / returns[n] + max(voxels[row, FLATNESS] - CLEAN_SIGMA_M**2, 0.0)
+        variance = max(RANGE_SIGMA_M**2, voxels[row, FLATNESS]) / returns[n] + max(
+            voxels[row, FLATNESS] - CLEAN_SIGMA_M**2, 0.0
+        )
         variance += ROUGH_SIGMA_M**2 + voxels[row, TILT] * away
         weight = min(1.0, HUBER * np.sqrt(variance) / max(abs(off), 1e-9)) / variance
         x = mat[0, 0] * voxels[row, NORMAL] + mat[1, 0] * voxels[row, NORMAL + 1] + mat[2, 0] * voxels[row, NORMAL + 2]

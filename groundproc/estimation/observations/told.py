@@ -129,7 +129,11 @@ def _face(
                 out[i, c] = by[0, c] * nx + by[1, c] * ny + by[2, c] * nz
             for c in range(3):
                 for a in range(6):
-                    some[a] = covariances[v, c, 0] * by[0, a] + covariances[v, c, 1] * by[1, a] + covariances[v, c, 2] * by[2, a]
+                    some[a] = (
+                        covariances[v, c, 0] * by[0, a]
+                        + covariances[v, c, 1] * by[1, a]
+                        + covariances[v, c, 2] * by[2, a]
+                    )
                 for a in range(6):
                     for b in range(6):
                         judged[k, a, b] -= rows.weight[i] * by[c, a] * some[b]
@@ -167,7 +171,11 @@ def _level(knot: Knots, jacobian: Singles, poses: Poses, normals: Array, out: Si
     rotation, xyz = poses.rotation, poses.xyz_m
     for i in range(len(jacobian)):
         for r in range(3):
-            out[i, r] = rotation[i, 3 * r] * jacobian[i, 0] + rotation[i, 3 * r + 1] * jacobian[i, 1] + rotation[i, 3 * r + 2] * jacobian[i, 2]
+            out[i, r] = (
+                rotation[i, 3 * r] * jacobian[i, 0]
+                + rotation[i, 3 * r + 1] * jacobian[i, 1]
+                + rotation[i, 3 * r + 2] * jacobian[i, 2]
+            )
             out[i, 3 + r] = jacobian[i, 3 + r]
         if i < len(relief) and abs(jacobian[i, 5]) > GROUND:
             for c in range(6):

@@ -213,7 +213,9 @@ def _match(
         if STANDING < lean <= cone and _may_be_ground(voxels[v, COUNT], voxels[v, TILT], lean):
             row[n] = -1
             continue
-        variance = RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * voxels[v, FLATNESS] + voxels[v, TILT] * off
+        variance = (
+            RANGE_SIGMA_M**2 / counts[n] + SURFACE_SIGMA_M**2 + 0.25 * voxels[v, FLATNESS] + voxels[v, TILT] * off
+        )
         weight[n] = min(1.0, 2.0 * np.sqrt(variance) / max(abs(e), 1e-9)) / (INFLATION * variance)
         residual[n] = e
         matched += 1
@@ -275,26 +277,24 @@ def _accumulate(
     for n in range(len(body)):
         if row[n] < 0:
             continue
-        v, e, b = row[n], residual[n], (body[n, 0], body[n, 1], body[n, 2])
+        v, e, own = row[n], residual[n], (body[n, 0], body[n, 1], body[n, 2])
         if voxels[v, FLATNESS] < 0.0:
             for c in range(3):
-                off[c] = (
-                    mat[c, 0] * b[0] + mat[c, 1] * b[1] + mat[c, 2] * b[2] + position[c] - voxels[v, MEAN + c]
-                )
-            _add_filled(voxels, v, mat, b, off, returns[n], planes.voxel_m, sums, (j, axis))
+                off[c] = mat[c, 0] * own[0] + mat[c, 1] * own[1] + mat[c, 2] * own[2] + position[c] - voxels[v, MEAN + c]
+            _add_filled(voxels, v, mat, own, off, returns[n], planes.voxel_m, sums, (j, axis))
             continue
         squares += e * e
-        _row(mat, b, voxels[v, NORMAL], voxels[v, NORMAL + 1], voxels[v, NORMAL + 2], j)
+        _row(mat, own, voxels[v, NORMAL], voxels[v, NORMAL + 1], voxels[v, NORMAL + 2], j)
         lean = voxels[v, NORMAL] * ground[0] + voxels[v, NORMAL + 1] * ground[1] + voxels[v, NORMAL + 2] * ground[2]
         if abs(lean) <= GROUND:
             _add(j, weight[n], e, sums.rest)
-            _row(mat, b, mean[n, 0], mean[n, 1], mean[n, 2], j)
+            _row(mat, own, mean[n, 0], mean[n, 1], mean[n, 2], j)
             _add(j, weight[n], e, sums.facing)
-            _take_off(mat, b, (unsure, n), weight[n], sums.facing, (by, some))
+            _take_off(mat, own, (unsure, n), weight[n], sums.facing, (by, some))
             continue
         _add(j, weight[n], e, sums.ground)
         side = 1.0 if lean > 0.0 else -1.0
-        _row(mat, b, side * ground[0], side * ground[1], side * ground[2], j)
+        _row(mat, own, side * ground[0], side * ground[1], side * ground[2], j)
         _add(j, weight[n], e, sums.level)
     for each in (sums.rest, sums.level, sums.ground, sums.facing):
         for a in range(6):
@@ -316,7 +316,10 @@ def _facing(planes: MapArrays, row: Ints, ground: Array) -> tuple[Array, Array]:
         v = row[n]
         if v < 0 or voxels[v, FLATNESS] < 0.0:
             continue
-        if abs(voxels[v, NORMAL] * ground[0] + voxels[v, NORMAL + 1] * ground[1] + voxels[v, NORMAL + 2] * ground[2]) > GROUND:
+        if (
+            abs(voxels[v, NORMAL] * ground[0] + voxels[v, NORMAL + 1] * ground[1] + voxels[v, NORMAL + 2] * ground[2])
+            > GROUND
+        ):
             continue
         at[count] = n
         for c in range(3):

@@ -147,7 +147,11 @@ def _insert(
             before = most
         added = np.float64(counts[n])
         total = before + added
-        dx, dy, dz = world[n, 0] - voxels[row, MEAN], world[n, 1] - voxels[row, MEAN + 1], world[n, 2] - voxels[row, MEAN + 2]
+        dx, dy, dz = (
+            world[n, 0] - voxels[row, MEAN],
+            world[n, 1] - voxels[row, MEAN + 1],
+            world[n, 2] - voxels[row, MEAN + 2],
+        )
         share = added / total
         weight = before * share
         voxels[row, COUNT] = total
@@ -166,7 +170,11 @@ def _insert(
             low, middle = _flattest(voxels, row, s, normal)
             if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
                 voxels[row, NORMAL], voxels[row, NORMAL + 1], voxels[row, NORMAL + 2] = normal[0], normal[1], normal[2]
-                voxels[row, LEVEL] = normal[0] * voxels[row, MEAN] + normal[1] * voxels[row, MEAN + 1] + normal[2] * voxels[row, MEAN + 2]
+                voxels[row, LEVEL] = (
+                    normal[0] * voxels[row, MEAN]
+                    + normal[1] * voxels[row, MEAN + 1]
+                    + normal[2] * voxels[row, MEAN + 2]
+                )
                 voxels[row, FLATNESS] = max(low, 0.0)
                 voxels[row, TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
             elif low > LEAST_SPREAD_M**2 and total >= FEWEST_SCATTERED:

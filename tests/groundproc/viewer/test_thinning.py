@@ -41,3 +41,17 @@ def test_a_small_cloud_is_not_thinned(clouds: Clouds, kind: int) -> None:
     assert some.spacing_m == 0.0
     assert some.time_s is not None
     assert len(some.time_s) == 3_000
+
+
+def test_of_a_flight_whole_stretches_are_read_and_they_are_its_own_points(clouds: Clouds) -> None:
+    path = clouds(450_000)[0]
+    some = thin(look(path), 60_000, in_time=True)
+    assert 0.9 * 60_000 <= len(some) <= 60_000
+    whole = laspy.read(path)
+    steps = np.rint((some.xyz_m - whole.header.offsets) / whole.header.scales).astype(int)
+    kept = {tuple(each) for each in steps.tolist()}
+    known = np.stack([whole.X, whole.Y, whole.Z], axis=1)
+    assert kept <= {tuple(each) for each in known.tolist()}
+    # four times as many points as are kept make two stretches of 100,000: of the begin and of the middle
+    read = np.concatenate([known[:100_000], known[200_000:300_000]])
+    assert kept <= {tuple(each) for each in read.tolist()}
