@@ -259,12 +259,13 @@ def _along_to_plane(voxels: Voxels, w: int, edge_m: float, ray: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _between(ray: Any, length: float, table: Any, voxels: Voxels, edge_m: float, neighbours: Any) -> Any:
+def _between(ray: Any, length: float, table: Any, voxels: Voxels, edge_m: float) -> Any:
     """Whether a ray meets a surface before and another behind a length, no farther from each other than a pulse is long.
 
-    A beam is wide, so what is in the voxel beside it counts. `neighbours` is working memory, shape (27,).
+    A beam is wide, so what is in the voxel beside it counts.
     """
     ox, oy, oz, ux, uy, uz = ray
+    neighbours = np.empty(27, np.int64)
     steps = int(np.ceil(REACH_M / edge_m))
     nearer, beyond = -np.inf, np.inf
     for each in range(
@@ -291,7 +292,6 @@ def _between(ray: Any, length: float, table: Any, voxels: Voxels, edge_m: float,
 
 @njit(cache=True, nogil=True)
 def _mixed(xyz: Any, origin: Any, voxel: Any, table: Any, voxels: Voxels, edge_m: float, out: Any) -> None:
-    neighbours = np.empty(27, np.int64)
     for n in range(len(xyz)):
         ox, oy, oz = origin[n, 0], origin[n, 1], origin[n, 2]
         ux, uy, uz = xyz[n, 0] - ox, xyz[n, 1] - oy, xyz[n, 2] - oz
@@ -302,4 +302,4 @@ def _mixed(xyz: Any, origin: Any, voxel: Any, table: Any, voxels: Voxels, edge_m
         v = voxel[n]
         if has_plane(voxels.normal, v) and abs(_along_to_plane(voxels, v, edge_m, ray) - length) < OFF_M:
             continue
-        out[n] = _between(ray, length, table, voxels, edge_m, neighbours)
+        out[n] = _between(ray, length, table, voxels, edge_m)

@@ -146,28 +146,11 @@ def _sigmas(xyz: Any, origin: Any, step: Any, errors: _Steps, incidence_deg: Any
     for i in range(len(xyz)):
         s = step[i]
         x, y, z = xyz[i, 0] - ins[s, 0], xyz[i, 1] - ins[s, 1], xyz[i, 2] - ins[s, 2]
+        t, b, p = turn[s], both[s], place[s]
         # a turn w moves the point by w x r: east by w1 z - w2 y, north by w2 x - w0 z, up by w0 y - w1 x
-        east = (
-            place[s, 0, 0]
-            + 2.0 * (both[s, 0, 1] * z - both[s, 0, 2] * y)
-            + turn[s, 1, 1] * z * z
-            + turn[s, 2, 2] * y * y
-            - 2.0 * turn[s, 1, 2] * y * z
-        )
-        north = (
-            place[s, 1, 1]
-            + 2.0 * (both[s, 1, 2] * x - both[s, 1, 0] * z)
-            + turn[s, 2, 2] * x * x
-            + turn[s, 0, 0] * z * z
-            - 2.0 * turn[s, 0, 2] * x * z
-        )
-        up = (
-            place[s, 2, 2]
-            + 2.0 * (both[s, 2, 0] * y - both[s, 2, 1] * x)
-            + turn[s, 0, 0] * y * y
-            + turn[s, 1, 1] * x * x
-            - 2.0 * turn[s, 0, 1] * x * y
-        )
+        east = p[0, 0] + 2.0 * (b[0, 1] * z - b[0, 2] * y) + t[1, 1] * z * z + t[2, 2] * y * y - 2.0 * t[1, 2] * y * z
+        north = p[1, 1] + 2.0 * (b[1, 2] * x - b[1, 0] * z) + t[2, 2] * x * x + t[0, 0] * z * z - 2.0 * t[0, 2] * x * z
+        up = p[2, 2] + 2.0 * (b[2, 0] * y - b[2, 1] * x) + t[0, 0] * y * y + t[1, 1] * x * x - 2.0 * t[0, 1] * x * y
         x, y, z = xyz[i, 0] - origin[i, 0], xyz[i, 1] - origin[i, 1], xyz[i, 2] - origin[i, 2]
         square = x * x + y * y + z * z
         slant = np.float64(incidence_deg[i]) if told else np.nan

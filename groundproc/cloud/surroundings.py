@@ -225,7 +225,6 @@ def _place_of(key: Any, table: Any, keys: Any, used: int) -> Any:
 @njit(cache=True, nogil=True)
 def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels: Voxels, used: int) -> int:
     keys, many, sums, when = voxels.key, voxels.many, voxels.sums, voxels.when_ms
-    looks, farthest, seen = voxels.looks, voxels.farthest_m, voxels.seen
     per_m = 1.0 / edge_m
     for n in range(len(xyz)):
         i, j, k = np.floor(xyz[n, 0] * per_m), np.floor(xyz[n, 1] * per_m), np.floor(xyz[n, 2] * per_m)
@@ -236,29 +235,30 @@ def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels:
             when[v, 0], when[v, 1] = time_ms[n], time_ms[n] - LOOK_MS
         many[v] += 1
         if time_ms[n] - when[v, 1] >= LOOK_MS:
-            looks[v] += 1
+            voxels.looks[v] += 1
         when[v, 1] = time_ms[n]
         if many[v] <= MOST_POINTS:
             a, b, c = xyz[n, 0] - origin[n, 0], xyz[n, 1] - origin[n, 1], xyz[n, 2] - origin[n, 2]
             square = a * a + b * b + c * c
             inverse = 1.0 / np.sqrt(max(square, 1e-12))
-            farthest[v] = max(farthest[v], square * inverse)
-            seen[v, 0] += a * inverse
-            seen[v, 1] += b * inverse
-            seen[v, 2] += c * inverse
+            voxels.farthest_m[v] = max(voxels.farthest_m[v], square * inverse)
+            voxels.seen[v, 0] += a * inverse
+            voxels.seen[v, 1] += b * inverse
+            voxels.seen[v, 2] += c * inverse
             x = np.float32(xyz[n, 0] - (i + 0.5) * edge_m)
             y = np.float32(xyz[n, 1] - (j + 0.5) * edge_m)
             z = np.float32(xyz[n, 2] - (k + 0.5) * edge_m)
-            sums[v, 0] += 1.0
-            sums[v, 1] += x
-            sums[v, 2] += y
-            sums[v, 3] += z
-            sums[v, 4] += x * x
-            sums[v, 5] += x * y
-            sums[v, 6] += x * z
-            sums[v, 7] += y * y
-            sums[v, 8] += y * z
-            sums[v, 9] += z * z
+            s = sums[v]
+            s[0] += 1.0
+            s[1] += x
+            s[2] += y
+            s[3] += z
+            s[4] += x * x
+            s[5] += x * y
+            s[6] += x * z
+            s[7] += y * y
+            s[8] += y * z
+            s[9] += z * z
     return used
 
 

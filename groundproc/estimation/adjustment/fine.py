@@ -152,20 +152,19 @@ def _add(
         row = find(table, keys, voxel_key(place[0], place[1], place[2], 1.0 / voxel_m))
         if row < 0 or voxels[row, FLATNESS] < 0.0 or voxels[row, COUNT] < FEWEST:
             continue
-        off, away = -voxels[row, LEVEL], 0.0
+        v = voxels[row]
+        off, away = -v[LEVEL], 0.0
         for c in range(3):
-            off += voxels[row, NORMAL + c] * place[c]
-            away += (place[c] - voxels[row, MEAN + c]) ** 2
+            off += v[NORMAL + c] * place[c]
+            away += (place[c] - v[MEAN + c]) ** 2
         if abs(off) > GATE_M:
             continue
-        variance = max(RANGE_SIGMA_M**2, voxels[row, FLATNESS]) / returns[n] + max(
-            voxels[row, FLATNESS] - CLEAN_SIGMA_M**2, 0.0
-        )
-        variance += ROUGH_SIGMA_M**2 + voxels[row, TILT] * away
+        variance = max(RANGE_SIGMA_M**2, v[FLATNESS]) / returns[n] + max(v[FLATNESS] - CLEAN_SIGMA_M**2, 0.0)
+        variance += ROUGH_SIGMA_M**2 + v[TILT] * away
         weight = min(1.0, HUBER * np.sqrt(variance) / max(abs(off), 1e-9)) / variance
-        x = mat[0, 0] * voxels[row, NORMAL] + mat[1, 0] * voxels[row, NORMAL + 1] + mat[2, 0] * voxels[row, NORMAL + 2]
-        y = mat[0, 1] * voxels[row, NORMAL] + mat[1, 1] * voxels[row, NORMAL + 1] + mat[2, 1] * voxels[row, NORMAL + 2]
-        z = mat[0, 2] * voxels[row, NORMAL] + mat[1, 2] * voxels[row, NORMAL + 1] + mat[2, 2] * voxels[row, NORMAL + 2]
+        x = mat[0, 0] * v[NORMAL] + mat[1, 0] * v[NORMAL + 1] + mat[2, 0] * v[NORMAL + 2]
+        y = mat[0, 1] * v[NORMAL] + mat[1, 1] * v[NORMAL + 1] + mat[2, 1] * v[NORMAL + 2]
+        z = mat[0, 2] * v[NORMAL] + mat[1, 2] * v[NORMAL + 1] + mat[2, 2] * v[NORMAL + 2]
         j[0], j[1], j[2] = xyz[n, 1] * z - xyz[n, 2] * y, xyz[n, 2] * x - xyz[n, 0] * z, xyz[n, 0] * y - xyz[n, 1] * x
         for a in range(3):
             pull[i, a] += weight * (1.0 - share) * off * j[a]

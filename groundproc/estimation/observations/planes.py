@@ -285,9 +285,10 @@ def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: Poses, normals:
         nx, ny, nz = normals[v]
         for i in range(first[v], first[v + 1]):
             n = kept[i]
-            p = nx * rotation[n, 0] + ny * rotation[n, 3] + nz * rotation[n, 6]
-            q = nx * rotation[n, 1] + ny * rotation[n, 4] + nz * rotation[n, 7]
-            s = nx * rotation[n, 2] + ny * rotation[n, 5] + nz * rotation[n, 8]
+            r = rotation[n]
+            p = nx * r[0] + ny * r[3] + nz * r[6]
+            q = nx * r[1] + ny * r[4] + nz * r[7]
+            s = nx * r[2] + ny * r[5] + nz * r[8]
             x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
             jacobian[i, 0], jacobian[i, 1], jacobian[i, 2] = y * s - z * q, z * p - x * s, x * q - y * p
             jacobian[i, 3], jacobian[i, 4], jacobian[i, 5] = nx, ny, nz

@@ -120,20 +120,17 @@ def _face(
         if nx == 0.0 and ny == 0.0 and nz == 0.0:
             continue
         for i in range(rows.first[v], min(rows.first[v + 1], flat)):
-            k = rows.knot[i]
-            x = rotation[i, 0] * xyz[i, 0] + rotation[i, 1] * xyz[i, 1] + rotation[i, 2] * xyz[i, 2]
-            y = rotation[i, 3] * xyz[i, 0] + rotation[i, 4] * xyz[i, 1] + rotation[i, 5] * xyz[i, 2]
-            z = rotation[i, 6] * xyz[i, 0] + rotation[i, 7] * xyz[i, 1] + rotation[i, 8] * xyz[i, 2]
+            m, k = rotation[i], rows.knot[i]
+            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
+            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
+            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
             by[0, 1], by[0, 2], by[1, 0], by[1, 2], by[2, 0], by[2, 1] = z, -y, -z, x, y, -x
             for c in range(6):
                 out[i, c] = by[0, c] * nx + by[1, c] * ny + by[2, c] * nz
             for c in range(3):
+                s = covariances[v, c]
                 for a in range(6):
-                    some[a] = (
-                        covariances[v, c, 0] * by[0, a]
-                        + covariances[v, c, 1] * by[1, a]
-                        + covariances[v, c, 2] * by[2, a]
-                    )
+                    some[a] = s[0] * by[0, a] + s[1] * by[1, a] + s[2] * by[2, a]
                 for a in range(6):
                     for b in range(6):
                         judged[k, a, b] -= rows.weight[i] * by[c, a] * some[b]
@@ -170,22 +167,18 @@ def _level(knot: Knots, jacobian: Singles, poses: Poses, normals: Array, out: Si
     """Rows by rotation about the map's axes and by position, those of ground with its mean normal; and what their own has beyond that."""
     rotation, xyz = poses.rotation, poses.xyz_m
     for i in range(len(jacobian)):
+        m, j = rotation[i], jacobian[i]
         for r in range(3):
-            out[i, r] = (
-                rotation[i, 3 * r] * jacobian[i, 0]
-                + rotation[i, 3 * r + 1] * jacobian[i, 1]
-                + rotation[i, 3 * r + 2] * jacobian[i, 2]
-            )
-            out[i, 3 + r] = jacobian[i, 3 + r]
-        if i < len(relief) and abs(jacobian[i, 5]) > GROUND:
-            for c in range(6):
-                relief[i, c] = out[i, c]
-            side = 1.0 if jacobian[i, 5] > 0.0 else -1.0
-            k = knot[i]
-            nx, ny, nz = side * normals[k, 0], side * normals[k, 1], side * normals[k, 2]
-            x = rotation[i, 0] * xyz[i, 0] + rotation[i, 1] * xyz[i, 1] + rotation[i, 2] * xyz[i, 2]
-            y = rotation[i, 3] * xyz[i, 0] + rotation[i, 4] * xyz[i, 1] + rotation[i, 5] * xyz[i, 2]
-            z = rotation[i, 6] * xyz[i, 0] + rotation[i, 7] * xyz[i, 1] + rotation[i, 8] * xyz[i, 2]
+            out[i, r] = m[3 * r] * j[0] + m[3 * r + 1] * j[1] + m[3 * r + 2] * j[2]
+            out[i, 3 + r] = j[3 + r]
+        if i < len(relief) and abs(j[5]) > GROUND:
+            relief[i] = out[i]
+            side = 1.0 if j[5] > 0.0 else -1.0
+            n = normals[knot[i]]
+            nx, ny, nz = side * n[0], side * n[1], side * n[2]
+            x = m[0] * xyz[i, 0] + m[1] * xyz[i, 1] + m[2] * xyz[i, 2]
+            y = m[3] * xyz[i, 0] + m[4] * xyz[i, 1] + m[5] * xyz[i, 2]
+            z = m[6] * xyz[i, 0] + m[7] * xyz[i, 1] + m[8] * xyz[i, 2]
             out[i, 0], out[i, 1], out[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
             out[i, 3], out[i, 4], out[i, 5] = nx, ny, nz
             for c in range(6):
@@ -206,8 +199,9 @@ def _take(rows: RowArrays, kept: tuple[Array, Array], parts: tuple[Singles, Sing
                 row[b] += level[i, a] * known[k, a, b]
                 if i < len(relief):
                     row[b] += relief[i, a] * share[k, a, b]
+        m = rotation[i]
         for c in range(3):
-            jacobian[i, c] = rotation[i, c] * row[0] + rotation[i, 3 + c] * row[1] + rotation[i, 6 + c] * row[2]
+            jacobian[i, c] = m[c] * row[0] + m[3 + c] * row[1] + m[6 + c] * row[2]
             jacobian[i, 3 + c] = row[3 + c]
 
 

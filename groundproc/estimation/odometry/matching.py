@@ -280,7 +280,9 @@ def _accumulate(
         v, e, own = row[n], residual[n], (body[n, 0], body[n, 1], body[n, 2])
         if voxels[v, FLATNESS] < 0.0:
             for c in range(3):
-                off[c] = mat[c, 0] * own[0] + mat[c, 1] * own[1] + mat[c, 2] * own[2] + position[c] - voxels[v, MEAN + c]
+                off[c] = (
+                    mat[c, 0] * own[0] + mat[c, 1] * own[1] + mat[c, 2] * own[2] + position[c] - voxels[v, MEAN + c]
+                )
             _add_filled(voxels, v, mat, own, off, returns[n], planes.voxel_m, sums, (j, axis))
             continue
         squares += e * e

@@ -246,21 +246,22 @@ def _gather(returns: _Returns, poses: PathArrays, voxels: _Table, sums: Array, l
             sums[row, 12] = (np.floor(x * per_m) + 0.5) * voxel_m
             sums[row, 13] = (np.floor(y * per_m) + 0.5) * voxel_m
             sums[row, 14] = (np.floor(z * per_m) + 0.5) * voxel_m
-        x -= sums[row, 12]
-        y -= sums[row, 13]
-        z -= sums[row, 14]
-        sums[row, 0] += 1.0
-        sums[row, 1] += since
-        sums[row, 2] += x
-        sums[row, 3] += y
-        sums[row, 4] += z
-        sums[row, 5] += x * x
-        sums[row, 6] += x * y
-        sums[row, 7] += x * z
-        sums[row, 8] += y * y
-        sums[row, 9] += y * z
-        sums[row, 10] += z * z
-        sums[row, 11] += np.sqrt(a * a + b * b + c_ * c_)
+        s = sums[row]
+        x -= s[12]
+        y -= s[13]
+        z -= s[14]
+        s[0] += 1.0
+        s[1] += since
+        s[2] += x
+        s[3] += y
+        s[4] += z
+        s[5] += x * x
+        s[6] += x * y
+        s[7] += x * z
+        s[8] += y * y
+        s[9] += y * z
+        s[10] += z * z
+        s[11] += np.sqrt(a * a + b * b + c_ * c_)
     for row in range(found):
         table[slots[row]] = -1
     return found

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.numerics.planes import flattest
+from groundproc.numerics.planes import add_scatter, flattest_of
 from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
@@ -140,55 +140,34 @@ def _insert(
             table[slot], keys[row] = row, key
             voxels[row] = 0.0
             count += 1
-        before = voxels[row, COUNT]
+        v = voxels[row]
+        before = v[COUNT]
         if before > most:
             for c in range(SCATTER, SCATTER + 6):
-                voxels[row, c] *= most / before
+                v[c] *= most / before
             before = most
         added = np.float64(counts[n])
         total = before + added
-        dx, dy, dz = (
-            world[n, 0] - voxels[row, MEAN],
-            world[n, 1] - voxels[row, MEAN + 1],
-            world[n, 2] - voxels[row, MEAN + 2],
-        )
+        dx, dy, dz = world[n, 0] - v[MEAN], world[n, 1] - v[MEAN + 1], world[n, 2] - v[MEAN + 2]
         share = added / total
         weight = before * share
-        voxels[row, COUNT] = total
-        voxels[row, MEAN] += share * dx
-        voxels[row, MEAN + 1] += share * dy
-        voxels[row, MEAN + 2] += share * dz
-        voxels[row, SCATTER] += scatter[n, 0] + weight * dx * dx
-        voxels[row, SCATTER + 1] += scatter[n, 1] + weight * dx * dy
-        voxels[row, SCATTER + 2] += scatter[n, 2] + weight * dx * dz
-        voxels[row, SCATTER + 3] += scatter[n, 3] + weight * dy * dy
-        voxels[row, SCATTER + 4] += scatter[n, 4] + weight * dy * dz
-        voxels[row, SCATTER + 5] += scatter[n, 5] + weight * dz * dz
-        voxels[row, FLATNESS], voxels[row, SPREAD] = -1.0, 0.0
+        v[COUNT] = total
+        v[MEAN] += share * dx
+        v[MEAN + 1] += share * dy
+        v[MEAN + 2] += share * dz
+        add_scatter(v[SCATTER : SCATTER + 6], 1.0, scatter[n], weight, (dx, dy, dz))
+        v[FLATNESS], v[SPREAD] = -1.0, 0.0
         if total >= FEWEST:
             s = 1.0 / total
-            low, middle = _flattest(voxels, row, s, normal)
+            low, middle = flattest_of(v[SCATTER : SCATTER + 6], s, normal)
             if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
-                voxels[row, NORMAL], voxels[row, NORMAL + 1], voxels[row, NORMAL + 2] = normal[0], normal[1], normal[2]
-                voxels[row, LEVEL] = (
-                    normal[0] * voxels[row, MEAN]
-                    + normal[1] * voxels[row, MEAN + 1]
-                    + normal[2] * voxels[row, MEAN + 2]
-                )
-                voxels[row, FLATNESS] = max(low, 0.0)
-                voxels[row, TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
+                v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
+                v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
+                v[FLATNESS] = max(low, 0.0)
+                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
             elif low > LEAST_SPREAD_M**2 and total >= FEWEST_SCATTERED:
-                largest, _ = _flattest(voxels, row, -s, longest)
+                largest, _ = flattest_of(v[SCATTER : SCATTER + 6], -s, longest)
                 for c in range(3):
-                    voxels[row, NORMAL + c], voxels[row, LONGEST + c] = normal[c], longest[c]
-                voxels[row, SPREAD], voxels[row, SPREAD + 1], voxels[row, SPREAD + 2] = low, middle, -largest
+                    v[NORMAL + c], v[LONGEST + c] = normal[c], longest[c]
+                v[SPREAD], v[SPREAD + 1], v[SPREAD + 2] = low, middle, -largest
     return count
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _flattest(voxels: Array, row: int, share: float, normal: Array) -> Any:
-    """`flattest` of a share of a voxel's scatter."""
-    return flattest(
-        share * voxels[row, SCATTER], share * voxels[row, SCATTER + 1], share * voxels[row, SCATTER + 2],
-        share * voxels[row, SCATTER + 3], share * voxels[row, SCATTER + 4], share * voxels[row, SCATTER + 5], normal,
-    )  # fmt: skip

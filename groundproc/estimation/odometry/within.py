@@ -139,7 +139,8 @@ def _add(
         row = find(planes.table, planes.keys, voxel_key(x, y, z, per_m))
         if row < 0:
             continue
-        if voxels[row, FLATNESS] < 0.0 and voxels[row, SPREAD] <= 0.0:
+        v = voxels[row]
+        if v[FLATNESS] < 0.0 and v[SPREAD] <= 0.0:
             continue
         step = min(max(seen.since_ns[n] / STEP_NS, 0.0), STEPS - 1e-9)
         i = int(step)
@@ -148,38 +149,35 @@ def _add(
             arm[c] = seen.world_m[n, c] - between
         node = min(int(step / APART), last - 1)
         share = step / APART - node
-        off = (x - voxels[row, MEAN], y - voxels[row, MEAN + 1], z - voxels[row, MEAN + 2])
-        if voxels[row, FLATNESS] >= 0.0:
+        off = (x - v[MEAN], y - v[MEAN + 1], z - v[MEAN + 2])
+        if v[FLATNESS] >= 0.0:
             away = off[0] ** 2 + off[1] ** 2 + off[2] ** 2
-            variance = max(RANGE_SIGMA_M**2, voxels[row, FLATNESS]) / seen.returns[n]
-            variance += max(voxels[row, FLATNESS] - CLEAN_SIGMA_M**2, 0.0) + SHARED_M**2 + voxels[row, TILT] * away
-            e = voxels[row, NORMAL] * x + voxels[row, NORMAL + 1] * y + voxels[row, NORMAL + 2] * z - voxels[row, LEVEL]
+            variance = max(RANGE_SIGMA_M**2, v[FLATNESS]) / seen.returns[n]
+            variance += max(v[FLATNESS] - CLEAN_SIGMA_M**2, 0.0) + SHARED_M**2 + v[TILT] * away
+            e = v[NORMAL] * x + v[NORMAL + 1] * y + v[NORMAL + 2] * z - v[LEVEL]
             if abs(e) > GATE_M:
                 continue
-            lean = voxels[row, NORMAL] * up[0] + voxels[row, NORMAL + 1] * up[1] + voxels[row, NORMAL + 2] * up[2]
-            nx, ny, nz = voxels[row, NORMAL], voxels[row, NORMAL + 1], voxels[row, NORMAL + 2]
+            lean = v[NORMAL] * up[0] + v[NORMAL + 1] * up[1] + v[NORMAL + 2] * up[2]
+            axis[0, :] = v[NORMAL : NORMAL + 3]
             if abs(lean) > GROUND:
                 # the ground's relief does not tell the heading
-                side = 1.0 if lean > 0.0 else -1.0
-                nx, ny, nz = side * up[0], side * up[1], side * up[2]
-            _row(arm, (nx, ny, nz), e, variance, (node, share), turn, system)
+                axis[0, :] = up if lean > 0.0 else -up
+            _row(arm, axis[0], e, variance, (node, share), turn, system)
             continue
-        for c in range(3):
-            axis[0, c], axis[2, c] = voxels[row, NORMAL + c], voxels[row, LONGEST + c]
+        axis[0, :], axis[2, :] = v[NORMAL : NORMAL + 3], v[LONGEST : LONGEST + 3]
         axis[1, 0] = axis[2, 1] * axis[0, 2] - axis[2, 2] * axis[0, 1]
         axis[1, 1] = axis[2, 2] * axis[0, 0] - axis[2, 0] * axis[0, 2]
         axis[1, 2] = axis[2, 0] * axis[0, 1] - axis[2, 1] * axis[0, 0]
         for k in range(3):
-            moves = max(1.0 - 12.0 * voxels[row, SPREAD + k] / planes.voxel_m**2, 1e-3)
-            variance = (voxels[row, SPREAD + k] / min(seen.returns[n], FILLED_RETURNS) + FILLED_SIGMA_M**2) / moves
+            moves = max(1.0 - 12.0 * v[SPREAD + k] / planes.voxel_m**2, 1e-3)
+            variance = (v[SPREAD + k] / min(seen.returns[n], FILLED_RETURNS) + FILLED_SIGMA_M**2) / moves
             e = axis[k, 0] * off[0] + axis[k, 1] * off[1] + axis[k, 2] * off[2]
-            _row(arm, (axis[k, 0], axis[k, 1], axis[k, 2]), e, variance, (node, share), turn, system)
+            _row(arm, axis[k], e, variance, (node, share), turn, system)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _row(
-    arm: Array, normal: tuple[float, float, float], off: float, variance: float, where: tuple[int, float], turn: Array,
-    system: tuple[Array, Array],
+    arm: Array, normal: Array, off: float, variance: float, where: tuple[int, float], turn: Array, system: tuple[Array, Array]
 ) -> None:  # fmt: skip
     """Add a row: a distance along a normal, at a share of the way from one turn of the chain to the next."""
     node, share = where
