@@ -10,6 +10,7 @@ import atexit
 import contextlib
 import functools
 import hashlib
+import importlib.util
 import os
 import re
 import shutil
@@ -117,6 +118,11 @@ def _turn() -> _Turn:
     turn = Listener()
     event.register("numba:compiler_lock", turn)  # type: ignore[no-untyped-call]  # numba is not typed
     return turn
+
+
+def takes_turns() -> bool:
+    """Whether processes may compile at once: where the system has no such locks, two could take one number for two signatures."""
+    return importlib.util.find_spec("fcntl") is not None
 
 
 def choose() -> None:
