@@ -38,7 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--cell", type=float, metavar="M", help="size of a cell [m]; default: 0.5, of sparse clouds 1")
     parser.add_argument(
-        "--window", type=float, metavar="M", help="half the width of the largest building [m]; default: 20"
+        "--window",
+        type=float,
+        metavar="M",
+        help="half the width of the largest building [m]; default: 20, and wider halls by their walls",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file too")
     add_force(parser)

@@ -77,10 +77,11 @@ def bare_ground(lowest_m: Raster, settings: Settings) -> Bare:
     ground = known & (~_objects(surface - smooth, base, rise, settings) | pulls)
     surface = np.where(pulls, lowest_m, surface)
     height = _without(surface, ground)
-    wide = halls(surface, ground, known, settings)
-    if wide.any():
-        ground &= ~wide
-        height = _without(surface, ground)
+    if settings.hall_m:
+        wide = halls(surface, ground, known, settings)
+        if wide.any():
+            ground &= ~wide
+            height = _without(surface, ground)
     return Bare(height, reach_of(height, settings), ground, pit)
 
 

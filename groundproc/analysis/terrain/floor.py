@@ -100,7 +100,7 @@ class Floor:
         self.grid = _coarser(fine, times, settings.cell_m)
         self.height, self.reach = Sheet(self.grid, self._folder), Sheet(self.grid, self._folder)
         self.base = Sheet(self.grid, self._folder)
-        halo_m = max(2.0 * settings.window_m + 4.0 * settings.smoothing_m + FILL_M, HALO_M)
+        halo_m = max(2.0 * settings.window_m + 4.0 * settings.smoothing_m + FILL_M, HALO_M if settings.hall_m else 0.0)
         halo = round(halo_m / settings.cell_m)
         for block, around, cut in blocks(self.grid, halo):
             values = _least(lowest, around, times)

@@ -11,20 +11,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, find_objects, label, maximum_filter
 
-from groundproc.analysis.terrain.settings import Settings
+from groundproc.analysis.terrain.settings import HALL_M, Settings
 
 Raster = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-LARGEST_M: Final = 120.0
-"""Longest side of a hall, along the raster."""
 _STEEP: Final = 1.5
 """Rise over run of a wall between measured cells; a heap of earth stays below one."""
 _DROP_M: Final = 2.0
 """Of a wall."""
 _RIM_M: Final = 6.0
 """The ground beside a wall is looked for within this."""
-HALO_M: Final = LARGEST_M + 2.0 * _RIM_M
+HALO_M: Final = HALL_M + 2.0 * _RIM_M
 """A piece and what lies beside it end within so much."""
 _SHARE: Final = 0.9
 """Of the ground beside it that lies below the wall."""
@@ -55,7 +53,7 @@ def halls(surface_m: Raster, ground: Mask, known: Mask, settings: Settings) -> M
     # smaller ones are for the openings
     large = np.flatnonzero(np.bincount(pieces.ravel()) * cell_m**2 >= settings.window_m**2)
     places = find_objects(pieces)
-    left = [number for number in large if number and _whole(places[number - 1], ground.shape, LARGEST_M / cell_m)]
+    left = [number for number in large if number and _whole(places[number - 1], ground.shape, settings.hall_m / cell_m)]
     reach = 2 * round(_RIM_M / cell_m) + 1
     for _ in range(_ROUNDS):
         before = found.sum()

@@ -9,6 +9,8 @@ from groundproc.raster.grid import checked_cell
 
 COARSE_M: Final = 1.0
 FINE_M: Final = 0.5
+HALL_M: Final = 120.0
+"""Longest side of a hall, along the raster."""
 _DENSE: Final = 4.0
 """Points in a square metre from which cells of half a metre have one each, nearly everywhere."""
 
@@ -23,6 +25,8 @@ class Settings:
         Of the raster of lowest points.
     window_m : float
         Radius of the largest opening: half the shorter side of the largest object that is to go.
+    hall_m : float
+        Wider ones go by their walls, if no side is longer than this; 0 where the window is stated, which then is the largest.
     step_m, slope : float
         An object stands above an opening of radius r by more than step + slope r ...
     relief : float
@@ -37,6 +41,7 @@ class Settings:
 
     cell_m: float = COARSE_M
     window_m: float = 20.0
+    hall_m: float = HALL_M
     step_m: float = 0.1
     slope: float = 0.08
     relief: float = 0.5
@@ -72,7 +77,7 @@ def settings_for(preset: str, density_m2: float, cell_m: float | None, window_m:
     window = found.window_m if window_m is None else window_m
     if not (math.isfinite(window) and cell <= window <= 500.0):
         raise UsageError(f"--window {window:g} m: expected {cell:g} to 500 m, half the width of the largest building")
-    return replace(found, cell_m=cell, window_m=window)
+    return replace(found, cell_m=cell, window_m=window, hall_m=found.hall_m if window_m is None else 0.0)
 
 
 def radii(window_m: float, cell_m: float) -> list[int]:
