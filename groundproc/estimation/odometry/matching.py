@@ -236,15 +236,15 @@ def _may_be_ground(count: float, tilt: float, lean: float) -> bool:
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_filled(
-    voxels: Array, v: int, mat: Array, body: tuple[float, float, float], off: Array, count: int, voxel_m: float, sums: Sums,
+    voxel: tuple[Array, int], mat: Array, body: tuple[float, float, float], off: Array, count: int, voxel_m: float, sums: Sums,
     memory: tuple[Array, Array],
 ) -> None:  # fmt: skip
-    """Three rows along the axes of what fills a voxel, by its row in the map, to all that is not ground; working memory (6,), (3, 3).
+    """Three rows along the axes of what fills a voxel, one row of the map's, to all that is not ground; working memory (6,), (3, 3).
 
     The mean of a few returns lies about that of the voxel by its spread. What is cut off by the voxel's faces does not move them with
     the path: evenly filled from face to face, a spread of edge / sqrt(12), it tells nothing.
     """
-    j, axis = memory
+    (voxels, v), (j, axis) = voxel, memory
     for c in range(3):
         axis[0, c], axis[2, c] = voxels[v, NORMAL + c], voxels[v, LONGEST + c]
     axis[1, 0] = axis[2, 1] * axis[0, 2] - axis[2, 2] * axis[0, 1]
@@ -283,7 +283,7 @@ def _accumulate(
                 off[c] = (
                     mat[c, 0] * own[0] + mat[c, 1] * own[1] + mat[c, 2] * own[2] + position[c] - voxels[v, MEAN + c]
                 )
-            _add_filled(voxels, v, mat, own, off, returns[n], planes.voxel_m, sums, (j, axis))
+            _add_filled((voxels, v), mat, own, off, returns[n], planes.voxel_m, sums, (j, axis))
             continue
         squares += e * e
         _row(mat, own, voxels[v, NORMAL], voxels[v, NORMAL + 1], voxels[v, NORMAL + 2], j)
