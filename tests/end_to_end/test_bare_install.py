@@ -40,9 +40,14 @@ def pip(python: Path | str, *words: str | Path) -> None:
 
 
 def environment(folder: Path) -> Path:
-    """The bin folder of a new environment with nothing in it."""
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    """The bin folder of a new environment with nothing in it, pip neither."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     return folder / "bin"
+
+
+def install(made: Path, *words: str | Path) -> None:
+    """Install into an environment, by the pip of the one that runs the tests: a pip for each would take as long as the rest."""
+    pip(sys.executable, "--python", made / "python", "install", "--no-compile", *words)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +75,7 @@ def test_the_wheel_is_for_any_system(wheel: Path) -> None:
 def base(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bin folder of an environment with the wheel and what it needs in any case."""
     made = environment(tmp_path_factory.mktemp("base") / "venv")
-    pip(made / "python", "install", "--no-compile", wheel)
+    install(made, wheel)
     return made
 
 
@@ -78,7 +83,7 @@ def base(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with `[onboard]`: what an aircraft has, and nothing else."""
     made = environment(tmp_path_factory.mktemp("bare") / "venv")
-    pip(made / "python", "install", "--no-compile", f"{wheel}[onboard]")
+    install(made, f"{wheel}[onboard]")
     return made
 
 
@@ -89,7 +94,7 @@ def ground(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     To install `[ground]` in full takes minutes (numba, scipy, matplotlib); what it asks for is held against what is there instead.
     """
     made = environment(tmp_path_factory.mktemp("ground") / "venv")
-    pip(made / "python", "install", "--no-compile", "--no-deps", wheel)
+    install(made, "--no-deps", wheel)
     own = Path(call(made, "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
     (own / "libraries.pth").write_text("".join(f"{path}\n" for path in sys.path if path.endswith("site-packages")))
     return made

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,8 @@ SWATH = [sys.executable, "-c", "import sys; from groundproc.cli import main; sys
 
 
 @pytest.fixture(scope="module")
-def flight(simulated: Callable[..., Any]) -> Any:
-    from simulator.config import Options
-
-    return simulated("live_flight", "village", 18.0, Options())
+def flight(live_flight: Any) -> Any:
+    return live_flight
 
 
 @pytest.mark.soak

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +34,8 @@ POSITION_RMS_M = 0.05
 
 
 @pytest.fixture(scope="module")
-def flight(simulated: Callable[..., Any]) -> Any:
-    from simulator.config import Options
-
-    return simulated("live_flight", "village", FLIGHT_S, Options())
+def flight(live_flight: Any) -> Any:
+    return live_flight
 
 
 def free_port(kind: int = socket.SOCK_DGRAM) -> int:
@@ -144,29 +141,11 @@ def test_a_flight_is_followed_in_real_time(tmp_path: Path, flight: Any) -> None:
     assert len(cloud.points) == status["cloud"]["points"]
 
 
-def test_it_agrees_with_the_causal_method_on_the_log(tmp_path: Path, flight: Any) -> None:
-    """Behind the finished log, and by `swath process --method adjusted --causal`: the same filter in other slices."""
-    out, processed = tmp_path / "live", tmp_path / "processed"
-    assert main(["live", "--follow", str(flight.log), "--port", "0", "-o", str(out)]) == 0
-    words = ["--method", "adjusted", "--causal", "--products", "trajectory.gpx", "-o", str(processed)]
-    assert main(["process", str(flight.log), *words]) == 0
-    table, causal = rows(out), read_trajectory(processed / "trajectory.csv")
-    poses, covered = causal.where_covered(table["utc_ns"].astype(np.int64))
-    estimated = np.stack([table[name] for name in ("east_m", "north_m", "up_m")], axis=1)[covered]
-    # UTC labels of the live rows may be late by the link's delay: along the path that is no difference between methods
-    velocity = np.gradient(poses.position_m[covered], 0.1, axis=0)
-    rigid = best_rigid(estimated, poses.position_m[covered])
-    off = rigid.points(estimated) - poses.position_m[covered]
-    late_s = (off * velocity).sum() / np.square(velocity).sum()
-    assert abs(late_s) < 0.1
-    off = off - late_s * velocity
-    assert len(off) > 10 * (FLIGHT_S - START_S)
-    assert np.sqrt(np.square(off).sum(axis=1).mean()) < POSITION_RMS_M
-    assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < POSITION_RMS_M
-
-
-def test_a_log_that_grows_is_followed_to_its_end(tmp_path: Path, flight: Any) -> None:
-    grown, out = tmp_path / "grown.mcap", tmp_path / "live"
+@pytest.fixture(scope="module")
+def followed(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> npt.NDArray[np.void]:
+    """Rows of a log that was followed while it grew."""
+    folder = tmp_path_factory.mktemp("followed")
+    grown, out = folder / "grown.mcap", folder / "live"
     content = flight.log.read_bytes()
     grown.write_bytes(content[:100_000])
 
@@ -184,9 +163,32 @@ def test_a_log_that_grows_is_followed_to_its_end(tmp_path: Path, flight: Any) ->
     finally:
         writer.join()
     assert code == 0
-    table = rows(out)
-    assert len(table) >= 10 * (FLIGHT_S - START_S)
-    assert np.sqrt(np.mean(np.square(errors_m(flight, table)))) < POSITION_RMS_M
+    return rows(out)
+
+
+def test_a_log_that_grows_is_followed_to_its_end(followed: npt.NDArray[np.void], flight: Any) -> None:
+    assert len(followed) >= 10 * (FLIGHT_S - START_S)
+    assert np.sqrt(np.mean(np.square(errors_m(flight, followed)))) < POSITION_RMS_M
+
+
+def test_it_agrees_with_the_causal_method_on_the_log(
+    tmp_path: Path, flight: Any, followed: npt.NDArray[np.void]
+) -> None:
+    """Behind the log, and by `swath process --method adjusted --causal`: the same filter in other slices."""
+    words = ["--method", "adjusted", "--causal", "--products", "trajectory.gpx", "-o", str(tmp_path / "processed")]
+    assert main(["process", str(flight.log), *words]) == 0
+    table, causal = followed, read_trajectory(tmp_path / "processed" / "trajectory.csv")
+    poses, covered = causal.where_covered(table["utc_ns"].astype(np.int64))
+    estimated = np.stack([table[name] for name in ("east_m", "north_m", "up_m")], axis=1)[covered]
+    # UTC labels of the live rows may be late by the link's delay: along the path that is no difference between methods
+    velocity = np.gradient(poses.position_m[covered], 0.1, axis=0)
+    rigid = best_rigid(estimated, poses.position_m[covered])
+    off = rigid.points(estimated) - poses.position_m[covered]
+    late_s = (off * velocity).sum() / np.square(velocity).sum()
+    assert abs(late_s) < 0.1
+    off = off - late_s * velocity
+    assert len(off) > 10 * (FLIGHT_S - START_S)
+    assert np.sqrt(np.square(off).sum(axis=1).mean()) < POSITION_RMS_M
 
 
 def test_without_the_lidars_own_unit_the_autopilots_carries_it(tmp_path: Path, flight: Any) -> None:

@@ -62,10 +62,9 @@ def make(folder: Path, *words: str) -> None:
 
 @pytest.fixture(scope="module")
 def debs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both architectures, and a later version for amd64."""
+    """Both architectures."""
     folder = tmp_path_factory.mktemp("debs")
     make(folder)
-    make(folder, "amd64", "--version", "99.0")
     return folder
 
 
@@ -170,8 +169,9 @@ def builder_pages() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def guest(debs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guest]:
-    """A system without swathd and without a network, with the packages in /srv."""
+    """A system without swathd and without a network, with the package and a later version of it in /srv."""
     folder = tmp_path_factory.mktemp("guest")
+    make(debs, "amd64", "--version", "99.0")
     # a computer of its own lets services be started, and has no desktop that looks for updates after each installation
     others = "usr/sbin/policy-rc.d etc/apt/apt.conf.d/20packagekit"
     prepare = (
