@@ -25,21 +25,24 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 LONGEST = (
-    "end_to_end/test_adjusted.py",
-    "groundproc/steps/test_steps.py",
     "end_to_end/test_process.py",
-    "groundproc/strips/test_adjust_command.py",
-    "end_to_end/test_live.py",
-    "groundproc/estimation/test_filtered.py",
-    "end_to_end/test_adjusted_anchored.py",
+    "end_to_end/test_adjusted.py",
     "groundproc/steps/test_images.py",
     "end_to_end/test_estimate_folder.py",
-    "end_to_end/test_full_disk.py",
+    "end_to_end/test_live.py",
+    "groundproc/estimation/test_filtered.py",
+    "groundproc/strips/test_adjust_command.py",
     "groundproc/campaign/test_batch.py",
+    "end_to_end/test_adjusted_anchored.py",
+    "groundproc/steps/test_steps.py",
     "end_to_end/test_adjusted_natural.py",
+    "groundproc/analysis/test_smooth_command.py",
     "end_to_end/test_dynamic.py",
+    "end_to_end/test_bare_install.py",
+    "end_to_end/test_package.py",
     "groundproc/analysis/test_section_and_fuse.py",
-    "groundproc/commands/test_other_systems.py",
+    "groundproc/assessment/test_targets.py",
+    "end_to_end/test_pull.py",
 )
 """Files that take half a minute and more, the longest first."""
 
