@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyproj
-import shapely
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis import voxelsight
+from groundproc.analysis.sighttask import VOXELS, Task, along
 from groundproc.analysis.viewshed import EXACT, FAST, UNKNOWN, VISIBLE, Sight, bend_per_m, height_at, viewshed
 from groundproc.cloud import reader
 from groundproc.cloud.metres import Raster, unstated
@@ -23,11 +23,9 @@ from groundproc.raster.cells import Cells
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
 from groundproc.raster.relief import filled
-from groundproc.vectors.features import read_features
 
 Array = npt.NDArray[np.float64]
 
-VOXELS: Final = "voxels"
 MODES: Final = (EXACT, FAST, VOXELS)
 SUFFIXES: Final = (".tif", ".tiff")
 _CELL_M: Final = 0.5
@@ -35,48 +33,6 @@ _GAP_M: Final = 1.0
 """Gaps of a cloud's surface that are bridged, as in hillshades."""
 _MOST_CELLS: Final = 400_000_000
 """Cells that are held in memory at once: lines go everywhere."""
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """What is asked for.
-
-    Attributes
-    ----------
-    source : Path
-        A raster of heights, or a cloud.
-    output : Path
-    at_m : tuple of 2 floats or None
-        Easting and northing.
-    path : Path or None
-        Lines to look from, in place of one place.
-    step_m : float
-        Between the places along a line.
-    height_m, target_m : float
-        Observer and targets over the surface.
-    mode : str
-    reverse : bool
-        What sees the place, in place of what is seen from it: observers stand on the cells.
-    curved : bool
-        Earth and refraction.
-    cell_m : float or None
-        For clouds.
-    trajectory : Path or None
-        Of a cloud, for voxels: then rays are those of the flight.
-    """
-
-    source: Path
-    output: Path
-    at_m: tuple[float, float] | None
-    path: Path | None
-    step_m: float
-    height_m: float
-    target_m: float
-    mode: str
-    reverse: bool
-    curved: bool
-    cell_m: float | None
-    trajectory: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,21 +158,4 @@ def _places(task: Task, surface: Surface) -> list[tuple[float, float]]:
             f"{places[0][0]:.2f},{places[0][1]:.2f}: the surface has no height there, expected a place within {west:.2f} to "
             f"{west + columns * cell:.2f} E and {north - rows * cell:.2f} to {north:.2f} N with heights around it"
         )
-    return found
-
-
-def along(task: Task, crs: pyproj.CRS | None) -> list[tuple[float, float]]:
-    """Places along the lines of a file, and their ends."""
-    assert task.path is not None
-    if not task.step_m > 0.0:
-        raise UsageError(f"--step {task.step_m:g} m: expected more than 0")
-    features = read_features(task.path, "LineString")
-    if crs is not None:
-        features = features.into(crs)
-    found = []
-    for line in features.geometry:
-        count = max(int(np.ceil(line.length / task.step_m)), 1)
-        for share in np.linspace(0.0, 1.0, count + 1):
-            point = shapely.line_interpolate_point(line, share, normalized=True)
-            found.append((float(point.x), float(point.y)))
     return found

@@ -11,7 +11,7 @@ met in this column.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ from numba import njit
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from flightlog.errors import CoverageError, UsageError
+from groundproc.analysis.sighttask import Task, along
 from groundproc.cloud import reader
 from groundproc.cloud.metres import unstated
 from groundproc.cloud.sameness import agreed_crs
@@ -30,9 +31,6 @@ from groundproc.raster import geotiff
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
 
-if TYPE_CHECKING:
-    from groundproc.analysis.sights import Task
-
 Array = npt.NDArray[np.float64]
 
 _EDGE_M: Final = 0.5
@@ -42,7 +40,7 @@ _CROWN_M: Final = 4.0
 """What stands higher than its surroundings and is narrower than this is nothing to stand on."""
 
 
-def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
+def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
     """Transmittance from a place, or its mean over the places of a path, to every cell.
 
     Raises
@@ -100,7 +98,7 @@ def run(task: "Task", progress: Callable[[int], object]) -> dict[str, Any]:
 
 
 def _met(
-    task: "Task",
+    task: Task,
     cloud: reader.Cloud,
     path: sensorpath.Flown | None,
     voxels: tuple[Any, Any, float],
@@ -152,9 +150,7 @@ def _standing(lowest: Array, edge_m: float) -> Array:
     return np.where(seen & (lowest - opened > edge_m), opened, lowest)
 
 
-def _places(task: "Task", crs: Any, ground: Array, first: Any, edge_m: float) -> list[tuple[float, float]]:
-    from groundproc.analysis.sights import along
-
+def _places(task: Task, crs: Any, ground: Array, first: Any, edge_m: float) -> list[tuple[float, float]]:
     places = [task.at_m] if task.at_m is not None else along(task, crs)
     found = []
     for place in places:

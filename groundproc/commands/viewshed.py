@@ -40,8 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Look, and say how much is seen."""
     from tqdm import tqdm
 
-    from groundproc.analysis.sights import SUFFIXES, Task
+    from groundproc.analysis.sights import SUFFIXES
     from groundproc.analysis.sights import run as look
+    from groundproc.analysis.sighttask import Task
     from groundproc.commands.inputs import CLOUD, RASTER, SOLUTION_WORDS, SOLUTIONS, expect
     from groundproc.commands.outputs import claim_file, write_json
     from groundproc.commands.values import numbers
