@@ -21,7 +21,7 @@ from groundproc.analysis.deformation.surface import Task as SurfaceTask
 from groundproc.analysis.epochs import Epochs, Progress, agreed_crs, laid
 from groundproc.cloud import reader
 from groundproc.cloud.merger import Merger
-from groundproc.cloud.metres import unstated
+from groundproc.cloud.metres import Metres, agreed_metres, unstated
 from groundproc.cloud.tiles import Found, Tiles, side_for
 from groundproc.files import made_folder, written_aside
 from groundproc.radiometry.sensorpath import SensorPath, flown, recovered
@@ -99,7 +99,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     if task.trajectory_a is not None and task.trajectory_b is not None:
         options: dict[str, Any] = {"week": task.week, "undulation_m": task.undulation_m}
         paths = (flown(clouds[:1], task.trajectory_a, **options), flown(clouds[1:], task.trajectory_b, **options))
-    else:
+    elif agreed_metres(clouds).plain:
         seen = (recovered(clouds[0]), recovered(clouds[1]))
         paths = seen if None not in seen else paths
     epochs = laid(clouds, paths, task.registered, progress, (task.trajectory_a, task.trajectory_b), task.all_classes)
@@ -113,7 +113,7 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
             for name in FILES[:2]:
                 aside = stack.enter_context(written_aside(task.folder / name))
                 if name == CHANGES:
-                    _write_claims(aside, claims, crs)
+                    _write_claims(aside, claims, crs, epochs.metres)
                 else:
                     aside.write_text(json.dumps(told["registration"], indent=1) + "\n", encoding="utf-8")
             aside = stack.enter_context(written_aside(task.folder / CLOUD))
@@ -175,7 +175,7 @@ def _compare(task: Task, epochs: Epochs, rule: Rule, progress: Progress) -> tupl
 
 
 def _told(epochs: Epochs, rule: Rule, claims: list[tuple[str, Claim]]) -> dict[str, Any]:
-    registration = epochs.registration
+    registration, metres = epochs.registration, epochs.metres
     sigma = np.sqrt(np.diag(registration.covariance))
     kinds = [kind for kind, _ in claims]
     return {
@@ -185,15 +185,15 @@ def _told(epochs: Epochs, rule: Rule, claims: list[tuple[str, Claim]]) -> dict[s
         "warnings": unstated(*epochs.clouds), "voxel_m": rule.edge_m, "sway_m": rule.sway_m, "points_per_m2": epochs.per_m2,
         "unseen_by": "points behind, as seen from above" if epochs.paths[0] is None else f"beams, the sensor {epochs.paths[0].source}",
         "registration": {
-            "matrix": registration.matrix.tolist(), "about_m": registration.about_m.tolist(), "sigma_m": sigma[:3].tolist(),
+            "matrix": metres.matrix(registration.matrix).tolist(), "about_m": registration.about_m.tolist(), "sigma_m": sigma[:3].tolist(),
             "sigma_deg": np.rad2deg(sigma[3:]).tolist(), "residual_m": registration.residual_m, "overlap": registration.overlap,
             "fit": registration.fit,
         },
     }  # fmt: skip
 
 
-def _write_claims(path: Path, claims: list[tuple[str, Claim]], crs: pyproj.CRS | None) -> None:
-    places = np.array([claim.place_m for _, claim in claims]).reshape(-1, 3)
+def _write_claims(path: Path, claims: list[tuple[str, Claim]], crs: pyproj.CRS | None, metres: Metres) -> None:
+    places = metres.back(np.array([claim.place_m for _, claim in claims]).reshape(-1, 3))
     columns = {
         "kind": np.array([kind for kind, _ in claims], dtype="U8"),
         "volume_m3": np.array([claim.volume_m3 for _, claim in claims], np.float64),

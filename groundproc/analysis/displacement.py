@@ -182,9 +182,8 @@ def _of_tile(tile: Tile, radius_m: float, spacing_m: float, shift: Array) -> tup
         # of two squares it is that of the point next to it
         if not tile.core[int(every.query(middle)[1])]:
             continue
-        parts = [
-            each[np.sort(tree.query_ball_point(middle, radius_m))] for each, tree in zip((a, b), trees, strict=True)
-        ]
+        near = [np.sort(np.array(tree.query_ball_point(middle, radius_m), np.int64)) for tree in trees]
+        parts = [each[rows] for each, rows in zip((a, b), near, strict=True)]
         vector = patch_moved(parts[0], parts[1], shift) if min(map(len, parts)) >= _FEWEST else None
         if vector is None:
             without += 1
@@ -249,7 +248,8 @@ def _write(aside: Path, ending: str, epochs: Epochs, vectors: list[Vector]) -> N
     columns["told"] = np.array([int(np.max(row) < _UNTOLD_M) for row in sigma], np.int32)
     columns["turn_deg"] = np.array([np.rad2deg(each.turn_rad) for each in vectors], np.float64)
     columns["fit"] = np.array([each.fit for each in vectors], np.float64)
-    shapes = [shapely.LineString([each.place_m, each.place_m + each.moved_m]) for each in vectors]
+    ends = [np.array([each.place_m, each.place_m + each.moved_m]) for each in vectors]
+    shapes = [shapely.LineString(epochs.metres.back(each)) for each in ends]
     write_features(
         aside, Features(np.array(shapes, object), columns, epochs.crs), "LineString Z", "displacement", ending
     )

@@ -12,7 +12,7 @@ import pyproj
 from flightlog.errors import CoverageError, GeodesyError
 from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
-from groundproc.cloud.metres import metres_of
+from groundproc.cloud.metres import Metres, agreed_metres
 from groundproc.cloud.reader import Chunk, Cloud
 from groundproc.cloud.sameness import same
 from groundproc.cloud.selection import CLASS, standing
@@ -62,22 +62,28 @@ class Epochs:
         """Horizontal, of both."""
         return agreed_crs(self.clouds)
 
+    @property
+    def metres(self) -> Metres:
+        """The unit of both."""
+        return agreed_metres(self.clouds)
+
     def standing(self, chunk: Chunk) -> npt.NDArray[np.bool_]:
         """Which points of a chunk surfaces are made of."""
         return standing(chunk.points, self.all_classes)
 
     def chunks(self, number: int, columns: tuple[str, ...] = ()) -> Iterator[tuple[Chunk, Array, Array]]:
-        """Chunks of an epoch, their places in the frame of A, and the way from them to the sensor (0: not known)."""
+        """Chunks of an epoch, their places in metres in the frame of A, and the way from them to the sensor (0: not known)."""
+        metres = self.metres
         path, trajectory = self.paths[number], self.trajectories[number]
         tally = (
             Tally(trajectory, path, self.clouds[number]) if trajectory is not None and isinstance(path, Flown) else None
         )
         for chunk in reader.chunks(self.clouds[number], None if path is None else path.clock, (*columns, CLASS)):
-            xyz = chunk.points.xyz_m
+            xyz = metres.of(chunk.points.xyz_m)
             away = np.zeros((len(xyz), 3))
             if path is not None:
                 place, known = path.at(chunk)
-                away[known] = (place - xyz)[known]
+                away[known] = (metres.of(place) - xyz)[known]
                 if tally is not None:
                     tally.add(away, known)
             if number == 1:
@@ -117,14 +123,9 @@ def laid(
     CoverageError
         They have no place in common, or do not fit.
     GeodesyError
-        Their coordinates are not metres.
+        They differ in their CRS, or are no map coordinates.
     """
-    for cloud in clouds:
-        if not metres_of(cloud).plain:
-            assert cloud.horizontal is not None
-            raise GeodesyError(
-                f"{cloud.path}: is in {cloud.horizontal.name}, which is not in metres; expected a CRS that is"
-            )
+    agreed_crs(clouds)
     samples, low, high, per_m2 = _look(clouds, all_classes, progress)
     what = f"{clouds[0].path} and {clouds[1].path}"
     found = _unmoved(samples, what) if registered else register(samples[0], samples[1], what)
@@ -151,12 +152,13 @@ def _look(
     """A sample of both for the registration, what they span, and points on a square metre of the sparser."""
     samples, density = [], []
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    metres = agreed_metres(clouds)
     for cloud in clouds:
         step = max(1, -(-cloud.points // MOST))
         parts, cells, held = [], np.empty(0, np.int64), 0
         for chunk in reader.chunks(cloud, columns=(CLASS,)):
             progress("looking", len(chunk.points))
-            xyz = chunk.points.xyz_m[standing(chunk.points, all_classes)]
+            xyz = metres.of(chunk.points.xyz_m[standing(chunk.points, all_classes)])
             if not len(xyz):
                 continue
             held += len(xyz)

@@ -14,6 +14,7 @@ from groundproc.analysis.placesearch import Found, search
 from groundproc.analysis.registration import MOST, Registration, register
 from groundproc.cloud import reader
 from groundproc.cloud.merger import Merger
+from groundproc.cloud.metres import METRES, Metres, agreed_metres
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 
@@ -25,12 +26,25 @@ _LEAST_KNOWN_M: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Laid:
-    """A cloud and how it lies on the first; None: it is the first, or was left as it is. `place` is where a search put it."""
+    """A cloud and how it lies on the first.
+
+    Attributes
+    ----------
+    path : Path
+    points : int
+    registration : Registration or None
+        In metres; None: it is the first, or was left as it is.
+    place : Found or None
+        Where a search put it.
+    unit : Metres
+        Of the clouds.
+    """
 
     path: Path
     points: int
     registration: Registration | None
     place: Found | None = None
+    unit: Metres = METRES
 
 
 def fuse(
@@ -62,18 +76,23 @@ def fuse(
         a, b = first.horizontal, other.horizontal
         if a is not None and b is not None and not a.equals(b, ignore_axis_order=True):
             raise GeodesyError(f"{other.path}: is in {b.name}, but {first.path} in {a.name}; expected one CRS")
+    metres = agreed_metres(clouds)
     laid = [Laid(first.path, first.points, None)]
     if registered:
         laid += [Laid(cloud.path, cloud.points, None) for cloud in clouds[1:]]
     else:
-        base = _sample(first, progress)
+        base = metres.of(_sample(first, progress))
         for cloud in clouds[1:]:
-            laid.append(_laid(cloud, base, _sample(cloud, progress), f"{first.path} and {cloud.path}", searched))
+            sample = metres.of(_sample(cloud, progress))
+            found = _laid(cloud, base, sample, f"{first.path} and {cloud.path}", searched)
+            laid.append(replace(found, unit=metres))
     with written_aside(output) as aside, Merger(clouds, aside, ("epoch",)) as merged:
         squares: list[Squares] = [Squares() for _ in clouds]
         for number, (cloud, each) in enumerate(zip(clouds, laid, strict=True)):
             for chunk in reader.chunks(cloud, columns=()):
-                moved = None if each.registration is None else each.registration.move(chunk.points.xyz_m)
+                moved = None
+                if each.registration is not None:
+                    moved = metres.back(each.registration.move(metres.of(chunk.points.xyz_m)))
                 merged.write(chunk.record, {"epoch": np.full(len(chunk.points), number, np.uint8)}, moved)
                 squares[number].add(chunk.points.xyz_m if moved is None else moved)
                 progress(len(chunk.points))
@@ -130,8 +149,9 @@ def told(laid: Sequence[Laid]) -> list[dict[str, Any]]:
         found = each.registration
         if found is not None:
             sigma = np.sqrt(np.diag(found.covariance))
+            matrix = each.unit.matrix(found.matrix)
             one |= {
-                "matrix": found.matrix.tolist(), "sigma_m": sigma[:3].tolist(), "sigma_deg": np.rad2deg(sigma[3:]).tolist(),
+                "matrix": matrix.tolist(), "sigma_m": sigma[:3].tolist(), "sigma_deg": np.rad2deg(sigma[3:]).tolist(),
                 "residual_m": found.residual_m, "overlap": found.overlap, "fit": found.fit,
             }  # fmt: skip
         if each.place is not None:

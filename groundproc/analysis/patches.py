@@ -193,7 +193,8 @@ def _scatter(mean: Array, size: int) -> Array:
     if not known.any():
         return np.zeros(mean.shape)
     sheet = np.full((rows, columns), _tailed(np.abs(mean[known])[None])[0])
-    sheet[enough] = _tailed(parts[enough])
+    if enough.any():
+        sheet[enough] = _tailed(parts[enough])
     sheet = median_filter(sheet, 3, mode="nearest")
     return np.repeat(np.repeat(sheet, block, 0), block, 1)[: mean.shape[0], : mean.shape[1]]
 

@@ -254,6 +254,8 @@ def _split(
     for direction, part in zip(told.T, parts.T, strict=True):
         along = rows @ direction / scale
         own = np.bincount(group, along**2)
+        if not own.any():
+            continue
         asked = np.abs(np.bincount(group, along * left / scale)) / np.maximum(own, 1e-12)
         order = np.argsort(asked)
         middle = MAD_TO_SIGMA * asked[order[np.searchsorted(np.cumsum(own[order]), 0.5 * own.sum())]]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.metres import metres_of
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.selection import CLASS, standing
 from groundproc.files import written_aside
@@ -55,7 +56,7 @@ def section(
     ----------
     path, output : Path
     line_m : sequence of 4 floats
-        Easting and northing of the ends.
+        Easting and northing of the ends, in the unit of the cloud's CRS.
     width_m : float
     progress : callable
         Told of points done.
@@ -69,24 +70,25 @@ def section(
     CoverageError
         No point is there.
     """
-    start, end = np.array(line_m[:2], np.float64), np.array(line_m[2:], np.float64)
+    cloud = reader.look(path)
+    metres = metres_of(cloud)
+    start, end = (metres.across * np.array(each, np.float64) for each in (line_m[:2], line_m[2:]))
     length = float(np.linalg.norm(end - start))
     if not (length > 0.0 and width_m > 0.0):
         raise UsageError(f"a line of {length:g} m and a width of {width_m:g} m: expected more than 0 of both")
-    cloud = reader.look(path)
     ahead = (end - start) / length
     kept, left_out, low, high = 0, 0, np.inf, -np.inf
     bounds = [np.full(2, np.inf), np.full(2, -np.inf)]
     with written_aside(output) as aside:
         with _writer(cloud, aside, output.suffix.lower()) as new:
             for chunk in reader.chunks(cloud, columns=(*new.columns, CLASS)):
-                away = chunk.points.xyz_m[:, :2] - start
+                xyz = metres.of(chunk.points.xyz_m)
+                away = xyz[:, :2] - start
                 along, across = away @ ahead, away @ np.array([-ahead[1], ahead[0]])
                 inside = (along >= 0.0) & (along <= length) & (np.abs(across) <= width_m / 2.0)
                 stands = standing(chunk.points, all_classes)
                 left_out += int(np.count_nonzero(inside & ~stands))
                 inside &= stands
-                xyz = chunk.points.xyz_m
                 bounds = [np.minimum(bounds[0], xyz[:, :2].min(axis=0)), np.maximum(bounds[1], xyz[:, :2].max(axis=0))]
                 if inside.any():
                     kept += int(inside.sum())
@@ -94,6 +96,7 @@ def section(
                     new.add(chunk, inside, along[inside], across[inside])
                 progress(len(inside))
         if not kept:
+            bounds = [each / metres.across for each in bounds]
             raise CoverageError(
                 f"{path}: no point lies within {width_m / 2:g} m of the line; its points span {bounds[0][0]:.2f} to {bounds[1][0]:.2f} E "
                 f"and {bounds[0][1]:.2f} to {bounds[1][1]:.2f} N"
@@ -108,7 +111,7 @@ def _writer(cloud: reader.Cloud, aside: Path, suffix: str) -> Iterator["_Cloud |
         with aside.open("w", encoding="utf-8", newline="\n") as file:
             yield _Table(cloud, file)
     elif suffix == ".dxf":
-        drawing = _Drawing()
+        drawing = _Drawing(metres_of(cloud).up)
         yield drawing
         drawing.write(aside)
     else:
@@ -151,7 +154,8 @@ class _Drawing:
 
     columns: Final[tuple[str, ...]] = ("classification",)
 
-    def __init__(self) -> None:
+    def __init__(self, up: float) -> None:
+        self._up = up
         self._parts: list[npt.NDArray[np.int64]] = []
 
     def add(self, chunk: reader.Chunk, inside: Mask, along: Array, across: Array) -> None:
@@ -159,7 +163,7 @@ class _Drawing:
         del across
         known = "classification" in chunk.points.columns
         kind = chunk.points["classification"][inside] if known else np.zeros(len(along))
-        some = np.column_stack([along / _DRAWN_M, chunk.points.xyz_m[inside, 2] / _DRAWN_M, kind])
+        some = np.column_stack([along / _DRAWN_M, self._up * chunk.points.xyz_m[inside, 2] / _DRAWN_M, kind])
         self._parts.append(np.unique(np.rint(some).astype(np.int64), axis=0))
 
     def write(self, path: Path) -> None:

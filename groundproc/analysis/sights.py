@@ -13,7 +13,7 @@ from groundproc.analysis import voxelsight
 from groundproc.analysis.sighttask import VOXELS, Task, along
 from groundproc.analysis.viewshed import EXACT, FAST, UNKNOWN, VISIBLE, Sight, bend_per_m, height_at, viewshed
 from groundproc.cloud import reader
-from groundproc.cloud.metres import Raster, unstated
+from groundproc.cloud.metres import METRES, Metres, Raster, flat, metres_in, metres_of, unstated
 from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
@@ -43,6 +43,7 @@ class Surface:
     north_m: float
     grid: Grid
     crs: pyproj.CRS | None
+    unit: Metres
     warnings: tuple[str, ...] = ()
 
     def cell(self, place_m: Sequence[float]) -> tuple[float, float]:
@@ -69,9 +70,12 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
     seen = np.zeros(surface.height_m.shape, np.float32)
     known = np.zeros(surface.height_m.shape, np.bool_)
     above, target = (task.target_m, task.height_m) if task.reverse else (task.height_m, task.target_m)
+    unit = surface.unit
+    bend = bend_per_m(task.curved) * unit.across**2 / unit.up
     for place in places:
         column, row = surface.cell(place)
-        sight = Sight(column, row, above, target, bend_per_m(task.curved), surface.grid.cell_m)
+        # heights in the unit of the surface; a straight line stays one in any
+        sight = Sight(column, row, above / unit.up, target / unit.up, bend, surface.grid.cell_m)
         one = viewshed(surface.height_m, sight, task.mode)
         seen += one == VISIBLE
         known |= one != UNKNOWN
@@ -89,10 +93,12 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
 
     with written_aside(task.output) as aside:
         geotiff.write(aside, surface.grid, surface.crs, band, block, corner_m=(surface.west_m, surface.north_m))
-    area = surface.grid.cell_m**2
+    angles = surface.crs is not None and surface.crs.is_geographic
+    area = (surface.grid.cell_m * unit.across) ** 2
     return {
         "mode": task.mode, "places": len(places), "cells": int(known.size), "visible_cells": int((seen > 0).sum()),
-        "unknown_cells": int((~known).sum()), "visible_m2": float((seen > 0).sum() * area), "warnings": list(surface.warnings),
+        "unknown_cells": int((~known).sum()), "visible_m2": None if angles else float((seen > 0).sum() * area),
+        "warnings": list(surface.warnings),
     }  # fmt: skip
 
 
@@ -102,6 +108,9 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
             raise UsageError(f"--cell {task.cell_m:g}: is for clouds; {task.source} has cells of its own")
         with geotiff.opened(task.source) as raster:
             _check_size(raster.grid)
+            angles = raster.crs is not None and raster.crs.is_geographic
+            if task.curved:
+                flat(task.source, raster.crs)
             heights = raster.window(raster.grid)
             return Surface(
                 heights,
@@ -109,12 +118,14 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
                 raster.north_m,
                 raster.grid,
                 raster.crs,
+                METRES if angles else metres_in(raster.crs),
                 tuple(unstated(Raster(task.source, raster.crs))),
             )
-    cell_m = checked_cell(task.cell_m or _CELL_M)
     cloud = reader.look(task.source, SURFACES)
+    unit = metres_of(cloud)
+    cell_m = checked_cell(task.cell_m or _CELL_M)
     crs = agreed_crs([cloud])
-    cells = Cells(cell_m, {"max"})
+    cells = Cells(cell_m / unit.across, {"max"})
     for chunk in reader.chunks(cloud, columns=()):
         cells.add(chunk.points.xyz_m, chunk.points.xyz_m[:, 2])
         progress(len(chunk.points))
@@ -123,7 +134,7 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
         raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
     _check_size(grid)
     heights = filled(cells.window(grid, "max"), max(round(_GAP_M / cell_m), 1))
-    return Surface(heights, grid.west_m, grid.north_m, grid, crs, tuple(unstated(cloud)))
+    return Surface(heights, grid.west_m, grid.north_m, grid, crs, unit, tuple(unstated(cloud)))
 
 
 def _check_size(grid: Grid) -> None:

@@ -21,7 +21,7 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis.sighttask import Task, along
 from groundproc.cloud import reader
-from groundproc.cloud.metres import unstated
+from groundproc.cloud.metres import Metres, metres_of, unstated
 from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
@@ -51,11 +51,12 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
         raise UsageError(f"{task.source}: is a raster; --mode voxels looks through a cloud")
     edge_m = checked_cell(task.cell_m or _EDGE_M)
     cloud = reader.look(task.source, SURFACES)
-    crs = agreed_crs([cloud])
+    crs, metres = agreed_crs([cloud]), metres_of(cloud)
     path = None if task.trajectory is None else sensorpath.flown([cloud], task.trajectory)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for chunk in reader.chunks(cloud, columns=()):
-        low, high = np.minimum(low, chunk.points.xyz_m.min(axis=0)), np.maximum(high, chunk.points.xyz_m.max(axis=0))
+        xyz = metres.of(chunk.points.xyz_m)
+        low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
         progress(len(chunk.points))
     if not np.isfinite(low).all():
         raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
@@ -66,12 +67,12 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
             f"{task.source}: {shape[0]} x {shape[1]} x {shape[2]} voxels of {edge_m:g} m found, expected at most {_MOST:,}; choose a "
             "larger --cell, or cut out the part of interest with `swath section`"
         )
-    hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m), progress)
+    hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m), metres, progress)
     ground = _standing(ground, edge_m)
     through = _through(hits, passes)
-    grid = Grid(int(first[0]), int(first[1]), int(shape[0]), int(shape[1]), edge_m)
+    grid = Grid(int(first[0]), int(first[1]), int(shape[0]), int(shape[1]), edge_m / metres.across)
     total, known = np.zeros((shape[0], shape[1])), np.zeros((shape[0], shape[1]), np.int64)
-    places = _places(task, crs, ground, first, edge_m)
+    places = _places(task, crs, ground, first, edge_m, metres.across)
     for place in places:
         one = np.full((shape[0], shape[1]), np.nan)
         above, target = (task.target_m, task.height_m) if task.reverse else (task.height_m, task.target_m)
@@ -102,6 +103,7 @@ def _met(
     cloud: reader.Cloud,
     path: sensorpath.Flown | None,
     voxels: tuple[Any, Any, float],
+    metres: Metres,
     progress: Callable[[int], object],
 ) -> tuple[Any, Any, Array]:
     """Beams that ended in each voxel and that went through, and the lowest point of each column; voxels by their first, shape and edge."""
@@ -110,7 +112,8 @@ def _met(
     ground = np.full((shape[0], shape[1]), np.inf)
     tally = None if path is None or task.trajectory is None else sensorpath.Tally(task.trajectory, path, cloud)
     for chunk in reader.chunks(cloud, None if path is None else path.clock, ()):
-        local = chunk.points.xyz_m / edge_m - first
+        xyz = metres.of(chunk.points.xyz_m)
+        local = xyz / edge_m - first
         if path is None:
             away, known = np.tile([0.0, 0.0, 1.0], (len(local), 1)) * float(shape[2] + 1), np.ones(len(local), np.bool_)
         else:
@@ -120,7 +123,7 @@ def _met(
                 tally.add(away * edge_m, known)
         last = np.asarray(chunk.record.return_number) >= np.asarray(chunk.record.number_of_returns)
         _beams(local[known], away[known], last[known], hits, passes)
-        _lowest(local, chunk.points.xyz_m[:, 2], ground)
+        _lowest(local, xyz[:, 2], ground)
         progress(len(chunk.points))
     if tally is not None:
         tally.check()
@@ -150,10 +153,11 @@ def _standing(lowest: Array, edge_m: float) -> Array:
     return np.where(seen & (lowest - opened > edge_m), opened, lowest)
 
 
-def _places(task: Task, crs: Any, ground: Array, first: Any, edge_m: float) -> list[tuple[float, float]]:
+def _places(task: Task, crs: Any, ground: Array, first: Any, edge_m: float, across: float) -> list[tuple[float, float]]:
+    """Places of the observer in metres."""
     places = [task.at_m] if task.at_m is not None else along(task, crs)
     found = []
-    for place in places:
+    for place in ((east * across, north * across) for east, north in places):
         i, j = int(np.floor(place[0] / edge_m)) - first[0], int(np.floor(place[1] / edge_m)) - first[1]
         if 0 <= i < ground.shape[0] and 0 <= j < ground.shape[1] and np.isfinite(ground[i, j]):
             found.append(place)

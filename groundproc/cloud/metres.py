@@ -1,5 +1,6 @@
 """Clouds in metres, whatever unit their CRS has: feet at the door become metres, and results go back into the unit of the CRS."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -65,6 +66,11 @@ class Metres:
         """Metres in units of the CRS, shape (n, 3) or (3,)."""
         return xyz_m if self.plain else xyz_m / (self.across, self.across, self.up)
 
+    def matrix(self, moving_m: Array) -> Array:
+        """A matrix that moves metres as one that moves units of the CRS, shape (4, 4)."""
+        unit = np.diag([self.across, self.across, self.up, 1.0])
+        return moving_m if self.plain else np.asarray(np.linalg.solve(unit, moving_m @ unit), np.float64)
+
 
 METRES = Metres()
 
@@ -79,27 +85,55 @@ def unstated(*files: Stating) -> list[str]:
     return [f"{path} {why}" for path in dict.fromkeys(each.path for each in files if each.horizontal is None)]
 
 
+def flat(path: Path, crs: pyproj.CRS | None) -> None:
+    """Refuse coordinates that are no map's: angles, and those from the middle of the earth.
+
+    Raises
+    ------
+    GeodesyError
+    """
+    if crs is None or not (crs.is_geographic or crs.is_geocentric):
+        return
+    why = "degrees" if crs.is_geographic else "metres from the middle of the earth"
+    raise GeodesyError(
+        f"{path}: is in {crs.name}, whose coordinates are {why}; expected a projected CRS, such as a UTM zone"
+    )
+
+
+def metres_in(crs: pyproj.CRS | None) -> Metres:
+    """The unit of a CRS of maps, with its heights or without; of none it is the metre."""
+    if crs is None:
+        return METRES
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    across = float(parts[0].axis_info[0].unit_conversion_factor) if parts[0].axis_info else 1.0
+    up = across
+    if len(parts) > 1:
+        up = float(parts[1].axis_info[0].unit_conversion_factor)
+    elif len(crs.axis_info) > 2:
+        up = float(crs.axis_info[2].unit_conversion_factor)
+    name = str(parts[0].axis_info[0].unit_name) if parts[0].axis_info else "metre"
+    return Metres(across, up, name if up == across else f"{name}, heights of {up:.9g} m")
+
+
 def metres_of(cloud: Cloud) -> Metres:
     """The unit of a cloud; one that states no CRS is in metres.
 
     Raises
     ------
     GeodesyError
-        Its coordinates are angles.
+        Its coordinates are angles, or geocentric.
     """
-    crs = cloud.horizontal
-    if crs is None:
-        return Metres()
-    if crs.is_geographic:
-        raise GeodesyError(
-            f"{cloud.path}: is in {crs.name}, whose coordinates are degrees; expected a projected CRS, such as a UTM zone"
-        )
-    across = float(crs.axis_info[0].unit_conversion_factor) if crs.axis_info else 1.0
-    whole = cloud.crs
-    up = across
-    if whole is not None and whole.is_compound:
-        up = float(whole.sub_crs_list[1].axis_info[0].unit_conversion_factor)
-    elif whole is not None and len(whole.axis_info) > 2:
-        up = float(whole.axis_info[2].unit_conversion_factor)
-    name = str(crs.axis_info[0].unit_name) if crs.axis_info else "metre"
-    return Metres(across, up, name if up == across else f"{name}, heights of {up:.9g} m")
+    flat(cloud.path, cloud.horizontal)
+    return metres_in(cloud.crs)
+
+
+def agreed_metres(clouds: Sequence[Cloud]) -> Metres:
+    """The unit of clouds of one CRS; those that state none are in that of the others.
+
+    Raises
+    ------
+    GeodesyError
+        Coordinates are angles, or geocentric.
+    """
+    units = [metres_of(cloud) for cloud in clouds if cloud.horizontal is not None]
+    return units[0] if units else METRES

@@ -66,7 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
     seen = (
         f"mean transmittance {told['mean_transmittance']:.3f}"
         if "mean_transmittance" in told
-        else f"{told['visible_cells']:,} cells seen, {told['visible_m2']:,.0f} m2"
+        else f"{told['visible_cells']:,} cells seen"
+        + ("" if told["visible_m2"] is None else f", {told['visible_m2']:,.0f} m2")
     )
     print(f"{seen} of {told['cells']:,} cells, {told['unknown_cells']:,} unknown; {arguments.output}")
     return 0

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.metres import flat, metres_in
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
@@ -61,11 +62,14 @@ def orthophoto(
     checked_cell(cell_m)
     clouds = [reader.look(path, SURFACES) for path in paths]
     common, warnings = common_crs(clouds, crs)
+    flat(paths[0], common)
+    unit = metres_in(clouds[0].crs if crs is None else common)
+    cell = cell_m / unit.across
     for cloud in clouds:
         if attribute not in cloud.columns:
             helps = "; `swath reflectance` makes it" if attribute == "reflectance" else ""
             raise UsageError(f"{cloud.path}: has no {attribute}, but {', '.join(cloud.columns)}{helps}")
-    tops, points, told = Cells(cell_m, {"max"}), 0, attribute not in _STRENGTHS
+    tops, points, told = Cells(cell, {"max"}), 0, attribute not in _STRENGTHS
     for cloud in clouds:
         for chunk in reader.chunks(cloud, columns=(attribute,)):
             good = np.isfinite(chunk.points[attribute].astype(np.float64))
@@ -78,7 +82,7 @@ def orthophoto(
         raise CoverageError(f"{paths[0]}: not one point has a value of {attribute}")
     if not told:
         raise CoverageError(f"{paths[0]}: {attribute} is 0 for all points, expected the strength of each echo")
-    kept = _Blocks(grid, output.parent)
+    kept = _Blocks(grid, output.parent, _TOP_M / unit.up)
     for cloud in clouds:
         for chunk in reader.chunks(cloud, columns=(attribute,)):
             kept.add(chunk.points.xyz_m, chunk.points[attribute].astype(np.float64), tops)
@@ -99,11 +103,11 @@ def orthophoto(
 class _Blocks:
     """Points that are seen from above, on the disk by block of the raster, with those around it."""
 
-    def __init__(self, grid: Grid, folder: Path) -> None:
+    def __init__(self, grid: Grid, folder: Path, top: float) -> None:
         from groundproc.cloud.spool import Spool
 
         folder.mkdir(parents=True, exist_ok=True)
-        self._grid = grid
+        self._grid, self._top_within = grid, top
         self._dtype = np.dtype([("x", "f8"), ("y", "f8"), ("value", "f8")])
         self._spool = Spool(self._dtype, folder)
         self.used = 0
@@ -111,7 +115,7 @@ class _Blocks:
     def add(self, xyz_m: Array, values: Array, tops: Cells) -> None:
         """Take points, shape (n, 3) and (n,)."""
         good = np.isfinite(values)
-        good[good] = xyz_m[good, 2] >= self._top(xyz_m[good], tops) - _TOP_M
+        good[good] = xyz_m[good, 2] >= self._top(xyz_m[good], tops) - self._top_within
         self.used += int(good.sum())
         records = np.empty(int(good.sum()), self._dtype)
         records["x"], records["y"], records["value"] = xyz_m[good, 0], xyz_m[good, 1], values[good]

@@ -70,7 +70,7 @@ def lines_of(
     cell_m, least_drop_m, least_slope_rad : float
     """
     known = np.isfinite(ground_m)
-    if known.sum() < 9:
+    if known.sum() < 9 or min(known.shape) < 3:
         return []
     smooth = _blurred(ground_m, known)
     down, right = np.gradient(smooth, cell_m)

@@ -118,6 +118,8 @@ def find(lowest_m: Raster, window: Window, cell_m: float) -> list[tuple[Level, n
 
 def _flat(lowest_m: Raster, known: npt.NDArray[np.bool_], cell_m: float) -> npt.NDArray[np.bool_]:
     """Cells in the midst of what is level over some metres."""
+    if min(known.shape) < 2:
+        return np.zeros(known.shape, np.bool_)
     size = 2 * max(round(1.5 / cell_m), 1) + 1
     share = ndimage.uniform_filter(known.astype(np.float32), size)
     height = np.where(known, lowest_m, 0.0).astype(np.float64)

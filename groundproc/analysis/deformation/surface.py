@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis.deformation import cores as choice
@@ -251,19 +252,20 @@ def _write_areas(path: Path, found: list[Area], epochs: Epochs) -> None:
     def column(name: str) -> npt.NDArray[Any]:
         return np.array([getattr(each, name) for each in found], np.float64)
 
-    places = np.array([each.place_m for each in found]).reshape(-1, 3)
+    metres = epochs.metres
+    places = metres.back(np.array([each.place_m for each in found]).reshape(-1, 3))
     columns = {
         "kind": np.array([each.kind for each in found], object),
         **{name: column(name) for name in ("volume_m3", "sigma_m3", "area_m2", "mean_m", "most_m")},
         "x": places[:, 0], "y": places[:, 1], "z": places[:, 2], "cores": np.array([each.cores for each in found], np.int64),
     }  # fmt: skip
     shapes = np.array([_many(each.outline) for each in found], object)
+    if not metres.plain:
+        shapes = shapely.transform(shapes, lambda xy: xy / metres.across)  # outlines are flat
     write_features(path, Features(shapes, columns, epochs.crs), "MultiPolygon", "surface", ".geojson")
 
 
 def _many(outline: Any) -> Any:
-    import shapely
-
     return outline if outline.geom_type == "MultiPolygon" else shapely.MultiPolygon([outline])
 
 
@@ -274,7 +276,8 @@ def _write_cloud(
     seen, sigma, lod = told
     values = {name: np.full(len(records), np.nan, np.float32) for name in ("change_sigma", "change_lod")}
     values["change_sigma"][seen], values["change_lod"][seen] = sigma, lod
-    offset = np.floor(records["xyz"][0])
+    metres = epochs.metres
+    offset = np.floor(metres.back(records["xyz"][0]))
     with CloudWriter(
         path, _COLUMNS, crs=epochs.clouds[0].crs, offset_m=offset.tolist(), gps=False, about="swath"
     ) as out:
@@ -282,4 +285,6 @@ def _write_cloud(
             part = slice(start, start + 1_000_000)
             columns = {"change": state[part], "change_distance": np.array(records["distance"][part])}
             columns |= {name: each[part] for name, each in values.items()}
-            out.write(Points(np.zeros(len(columns["change"]), np.int64), np.array(records["xyz"][part]), columns))
+            out.write(
+                Points(np.zeros(len(columns["change"]), np.int64), metres.back(np.array(records["xyz"][part])), columns)
+            )

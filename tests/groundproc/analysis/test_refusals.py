@@ -6,6 +6,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import numpy.typing as npt
 import pyproj
 import pytest
 import rasterio
@@ -15,6 +16,7 @@ from strips import GPS_S, ORIGIN, Scene, Strip
 from groundproc.cli import main
 
 SIDE_M, COUNT, FAR_M = 30.0, 20_000, 10_000.0
+Array = npt.NDArray[np.float64]
 CRS_MEMBER = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
 
 
@@ -27,18 +29,26 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     xyz[(np.abs(xyz[:, 0] - 20) < 3) & (np.abs(xyz[:, 1] - 20) < 2), 2] += 3.0
     time_s = np.sort(rng.uniform(0, 20, COUNT))
 
-    def cloud(name: str, *, east: float = 0.0, crs: int | None = 32633, lit: bool = True, timed: bool = True) -> None:
+    def cloud(
+        name: str,
+        *,
+        east: float = 0.0,
+        crs: int | None = 32633,
+        lit: bool = True,
+        timed: bool = True,
+        shape: Array = xyz,
+    ) -> None:
         header = laspy.LasHeader(version="1.4", point_format=6)
         header.scales, header.offsets = [0.001] * 3, ORIGIN
         header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
         if crs is not None:
             header.add_crs(pyproj.CRS.from_epsg(crs))
         las = laspy.LasData(header)
-        las.xyz = xyz + ORIGIN + (east, 0, 0)
-        las.return_number = las.number_of_returns = las.classification = np.ones(COUNT, np.uint8)
+        las.xyz = shape + ORIGIN + (east, 0, 0)
+        las.return_number = las.number_of_returns = las.classification = np.ones(len(shape), np.uint8)
         if lit:
-            las.intensity = np.arange(COUNT) % 50 + 10
-        las.gps_time = time_s + GPS_S if timed else np.zeros(COUNT)
+            las.intensity = np.arange(len(shape)) % 50 + 10
+        las.gps_time = time_s[: len(shape)] + GPS_S if timed else np.zeros(len(shape))
         las.write(folder / name)
 
     cloud("a.laz")
@@ -49,6 +59,11 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud("far.laz", east=FAR_M)
     cloud("utm32.laz", crs=25832)
     cloud("degrees.laz", crs=4326)
+    cloud("geocentric.laz", crs=4978)
+    cloud("one.laz", shape=xyz[:1])
+    cloud("row.laz", shape=np.column_stack([np.linspace(0, SIDE_M, 500), np.full(500, 9.9), np.full(500, 100.0)]))
+    cloud("stray.laz", shape=np.concatenate([xyz[1:], xyz[:1] + np.array([9e5, 9e5, 0])]))
+    cloud("level.laz", shape=xyz * (1, 1, 0) + (0, 0, 100.0))
     for name, strip in (
         ("t.csv", Strip((0, 20, 130), (2, 0, 0), 0, 20)),
         ("t_far.csv", Strip((2 * FAR_M, 20, 130), (2, 0, 0), 0, 20)),
@@ -88,9 +103,22 @@ NOT_COMMON = r"have no place in common, expected clouds that lie on each other"
 OUTSIDE = r"outside of the clouds?, which spans? 533000 to 533030 E and 647(2000|1999) to 6472030 N"
 UNTIMED = r"gps_time is 0 for all points, expected the time of each point"
 DIFFERENT = r"utm32\.laz: .*in ETRS89 / UTM zone 32N, but a\.laz in WGS 84 / UTM zone 33N; expected one CRS"
+CRS_DIFFER = r"is in .*UTM zone.*, but .* in .*UTM zone.*; expected one CRS"
 DEGREES = r"degrees\.laz: .*expected a projected CRS"
 
 REFUSED = [
+    (
+        "ground geocentric.laz -o o.laz",
+        r"geocentric\.laz: .*metres from the middle of the earth; expected a projected CRS",
+    ),
+    ("orthophoto degrees.laz --attribute intensity -o o.tif", DEGREES),
+    ("section degrees.laz --line 533010,6472010,533020,6472020 -o o.laz", DEGREES),
+    ("viewshed degrees.laz --at 533010,6472010 --height 2 -o o.tif", DEGREES),
+    ("soil a.laz --before utm32.laz -o o.geojson", CRS_DIFFER),
+    ("displacement utm32.laz a.laz -o o.geojson", CRS_DIFFER),
+    ("banks a.laz --before utm32.laz -o o.geojson", CRS_DIFFER),
+    ("change level.laz b.laz -o o", r"level\.laz and b\.laz: "),
+    ("displacement level.laz b.laz -o o.geojson", r"level\.laz and b\.laz: "),
     ("ground a.laz --water area_far.geojson -o o.laz", OUTSIDE),
     ("ground degrees.laz -o o.laz", DEGREES),
     ("reflectance nocrs.laz -t t.csv -o o", r"nocrs\.laz: states no CRS; give it with --crs"),
@@ -214,3 +242,18 @@ def test_what_is_taken_for_granted_is_told_once(
     told = capsys.readouterr().err.splitlines()
     assert sum(re.search(sentence, line) is not None for line in told) == 1, told
     assert all(line.startswith("swath: warning: ") for line in told)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "soil one.laz -o o.geojson", "soil row.laz -o o.geojson", "banks one.laz -o o.geojson", "banks row.laz -o o.geojson",
+        "displacement stray.laz b.laz --registered -o o.geojson", "change row.laz b.laz --registered -o o",
+    ],
+)  # fmt: skip
+def test_a_cloud_of_a_point_or_a_row_or_with_one_far_away_is_taken(
+    place: Path, tmp_path: Path, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(place)
+    *others, output = words.split()
+    assert main([*others, str(tmp_path / output)]) == 0
