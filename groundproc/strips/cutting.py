@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
 from flightlog import frames
+from groundproc.numerics.filters import peaks
 from groundproc.strips.route import Route
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -148,12 +149,9 @@ def flown(trajectory: Trajectory) -> Iterator[tuple[Trajectory, int, int]]:
 
 def turns(poses: Trajectory, start_ns: int, bins: int, turn_deg: float) -> Ints:
     """Bins in the middle of turns, of so many from a time on."""
-    from scipy.signal import find_peaks  # half a second of every start
-
     course, change = courses(velocities(poses, start_ns, bins))
     half = _HALF
-    cuts, _ = find_peaks(change, height=np.deg2rad(turn_deg), prominence=np.deg2rad(turn_deg) / 4, distance=half)
-    found = cuts.tolist()
+    found = peaks(change, np.deg2rad(turn_deg), np.deg2rad(turn_deg) / 4, half).tolist()
     # a wide turn or a circle has no peak: what turns in its inner part is cut where the course is half-way
     left = list(itertools.pairwise([0, *found, bins - 1]))
     while left:

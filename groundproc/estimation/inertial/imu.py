@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from groundproc.flight.sync.tracks import low_pass
 from groundproc.numerics import robust
+from groundproc.numerics.filters import butterworth, forward_and_back, spectrum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -150,11 +151,9 @@ def white_share(mean: Array, good: Mask, step_s: float, density: float) -> float
     density : float
         What `noise_density` makes of the samples, on average.
     """
-    from scipy.signal import welch  # half a second of every start
-
     if len(mean) < 2 * FLOOR_STEPS or not good.any():
         return 1.0
-    at_hz, one_sided = welch(mean, 1.0 / step_s, nperseg=FLOOR_STEPS, axis=0)
+    at_hz, one_sided = spectrum(mean, 1.0 / step_s, FLOOR_STEPS)
     inside = (at_hz > FLOOR_HZ[0]) & (at_hz < FLOOR_HZ[1])
     quiet = float(np.quantile(one_sided[inside].mean(axis=1), FLOOR_QUANTILE))
     floor = 0.5 * quiet / float(good.mean())
@@ -197,11 +196,9 @@ def lever_matrices(rate_rad_s: Array, turning_rad_s2: Array) -> Array:
 
 def flat_low_pass(values: Array, cutoff_hz: float, rate_hz: float) -> Array:
     """Low-pass along the first axis that leaves slow motion its size: Butterworth of fourth order, forward and back."""
-    from scipy.signal import butter, sosfiltfilt  # half a second of every start
-
-    sections = butter(4, min(cutoff_hz, 0.45 * rate_hz), fs=rate_hz, output="sos")
+    sections = butterworth(min(cutoff_hz, 0.45 * rate_hz), rate_hz)
     padding = min(round(3 * rate_hz / cutoff_hz), len(values) - 1)
-    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding))
+    return forward_and_back(sections, values, padding)
 
 
 def align(
