@@ -89,7 +89,7 @@ def spectrum(values: Array, rate_hz: float, piece: int) -> tuple[Array, Array]:
     cut = (cut - cut.mean(axis=1, keepdims=True)) * window[:, None]
     power = np.square(np.abs(np.fft.rfft(cut, axis=1))).mean(axis=0) / (rate_hz * np.square(window).sum())
     power[1:-1] *= 2.0
-    return np.fft.rfftfreq(piece, 1.0 / rate_hz), power
+    return np.asarray(np.fft.rfftfreq(piece, 1.0 / rate_hz)), np.asarray(power, np.float64)
 
 
 def peaks(values: Array, height: float, prominence: float, apart: int) -> Ints:
