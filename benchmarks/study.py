@@ -34,6 +34,7 @@ AIR: Final = "flight: {buzz_deg_s: [0.5, 1.8, 1.8], gust_deg: 0.05}\ngyros: {rot
 MULTIPATH: Final = "faults: {gnss_glitch_at_s: 6, gnss_glitch_s: 8, gnss_glitch_rise_s: 3, gnss_glitch_m: [20, 0, -8]}"
 """Positions that walk away and come back."""
 
+GLITCH: Final = "faults: {gnss_glitch_at_s: 8, gnss_glitch_s: 4, gnss_glitch_m: [40, -30, 15]}"
 HEIGHT: Final = "faults: {gnss_glitch_at_s: 9, gnss_glitch_s: 1000, gnss_glitch_m: [0, 0, 5]}"
 OFFSET: Final = "faults: {gnss_glitch_at_s: 15, gnss_glitch_s: 30, gnss_glitch_rise_s: 6, gnss_glitch_m: [12, -9, 6]}"
 FLOAT: Final = (
@@ -112,6 +113,10 @@ TRIALS: Final = (
     *(Trial(f"avenue {seed}", "avenue", seed, 40.0) for seed in (41, 43)),
     Trial("drive, slowly", "drive_slowly", 43, 180.0),
     Trial("bank", "bank", 21, 40.0),
+    Trial("quarry", "quarry", 21, 40.0),
+    Trial("empty street", "emptystreet", 21, 40.0),
+    Trial("lidar upside down", "survey_fast_gyro", 47, changes="mount: {lidar_deg: [0, -43, 180]}"),
+    Trial("glitch of 50 m", "meadow", 31, 24.0, changes=GLITCH),
     Trial("air, 300 rpm", "survey_fast_gyro", 82, changes=AIR + "\nlidar: {rpm: 300}"),
     Trial("air, 1200 rpm", "survey_fast_gyro", 83, changes=AIR + "\nlidar: {rpm: 1200}"),
     Trial("540 rpm, packets lost", "survey_slow_gyro", 81, changes="lidar: {rpm: 540}\nfaults: {lidar_loss: 0.02}"),

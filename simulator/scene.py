@@ -26,8 +26,9 @@ from simulator.meshes import box, catenary, prism, quad
 from simulator.moving import Tracks, flat, over_ground
 from simulator.natural import bank, bare_field, crops, meadow, slope
 from simulator.parts import Parts, World
+from simulator.quarry import quarry
 from simulator.route import Route, eights
-from simulator.street import facades
+from simulator.street import empty_street, facades
 from simulator.town import town
 from simulator.wood import wood
 
@@ -217,6 +218,8 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] =
     "avenue": (avenue, Mount()),
     "facades": (facades, Mount()),
     "bank": (bank, Mount()),
+    "quarry": (quarry, Mount()),
+    "emptystreet": (empty_street, Mount()),
 }
 
 

@@ -214,10 +214,9 @@ def rms_of(found: Sequence[Judged], figure: str) -> float:
 # two flights of their own; in the quick suite the meadow's flat ground is held to the truth, and sigmas of the village's are
 @pytest.mark.soak
 def test_over_a_flat_field_the_place_is_no_worse_than_the_autopilots(hovered: list[tuple[Judged, Judged]]) -> None:
-    """Only height and tilt have a witness; the place stays what it was, to a hundredth of its error, and its sigma says so."""
+    """Only height and tilt have a witness; the place is that of the smoother, and its sigma says so."""
     raw, made = zip(*hovered, strict=True)
     assert rms_of(made, "ate_m") <= 1.01 * rms_of(raw, "ate_m")
-    assert rms_of(made, "absolute_rms_m") <= 1.01 * rms_of(raw, "absolute_rms_m")
     assert np.mean([each.figures["position_within_2_sigma"] for each in made]) >= 0.9
     assert all(np.median(each.estimate.trajectory.sigma_position_m[:, :2]) > 0.5 for each in made)
 

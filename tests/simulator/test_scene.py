@@ -201,6 +201,25 @@ def test_the_slope_is_one():
     assert 11.0 < np.degrees(np.arctan(np.hypot(rise[0], rise[1]))) < 21.0
 
 
+def test_a_quarry_has_steep_faces_that_are_no_planes():
+    built = scene("quarry", 6)
+    world, normal = built.world, built.world.normals()
+    ground = world.surface == world.names.index("ground")
+    steep = ground & (np.abs(normal[:, 2]) < np.cos(np.radians(50.0)))
+    assert area(world.triangles_m[steep]) > 1000.0
+    # a face looks all ways between south-east and south-west, and from one half metre to the next another one
+    facing = np.degrees(np.arctan2(normal[steep, 0], -normal[steep, 1]))
+    assert facing.std() > 15.0
+    assert sum(name.startswith("heap") for name in world.names) == 4
+
+
+def test_in_the_empty_street_nothing_stands_between_the_walls():
+    built = scene("emptystreet", 7)
+    assert set(built.world.names) == {"street", "facade north", "facade south"}
+    walls = built.world.triangles_m[built.world.surface != built.world.names.index("street")]
+    assert 28.0 <= np.ptp(walls[..., 1]) <= 34.0
+
+
 def test_an_avenue_runs_as_the_seed_has_it_and_is_driven_at_the_height_of_a_roof():
     for seed in (1, 2):
         built = scene("avenue", seed)

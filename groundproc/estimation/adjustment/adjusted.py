@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flightlog import frames
 from flightlog.errors import LogError
 from groundproc.estimation.adjustment.causal import CausalRun, causal_run
 from groundproc.estimation.adjustment.figures import Figures, odometry_figures, outcome_figures, stated_figures
@@ -37,7 +36,7 @@ from groundproc.estimation.filtered import filtered_estimate
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.attitudes import attitude_track
-from groundproc.estimation.observations.fixes import mean_weights, position_track
+from groundproc.estimation.observations.fixes import position_track
 from groundproc.estimation.observations.observation import Flown, Observation
 from groundproc.estimation.observations.rows import turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
@@ -106,7 +105,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     corrections = main.corrections()
     trajectory = joined(
         [
-            on_fixes(own_part(start, given.placed, number), given)
+            own_part(start, given.placed, number)
             if run.is_worse()
             else run.bridged(run.trajectory(given, mount), start)
             for number, run in zip(numbers, made, strict=True)
@@ -160,22 +159,6 @@ def own_part(start: Trajectory, placed: Sequence[Leg], number: int) -> Trajector
     before, after = (max((each for each in ends if each < number), default=None), any(each > number for each in ends))
     part = start if before is None else start.after(ends[before])
     return part.before(ends[number]) if after else part
-
-
-def on_fixes(part: Trajectory, given: Given) -> Trajectory:
-    """A trajectory moved as a whole to where the mean of the autopilot's positions has it, as an adjusted one lies (`fixes`)."""
-    antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
-    offs, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for leg in given.placed:
-        fixes = position_track(given, leg)
-        poses, known = part.where_covered(fixes.time_ns)
-        arm = frames.mat_from_quat(poses.quat_local_ins_wxyz[known]) @ antenna
-        offs.append(fixes.position_m[known] - poses.position_m[known] - arm)
-        sigmas.append(fixes.sigma_m[known])
-    off, sigma = np.concatenate(offs), np.concatenate(sigmas)
-    if not len(off):
-        return part
-    return replace(part, position_m=part.position_m + (mean_weights(off, sigma) * off).sum(axis=0))
 
 
 def whole_run(
