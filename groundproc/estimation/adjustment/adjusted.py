@@ -19,6 +19,7 @@ from groundproc.estimation.adjustment.figures import Figures, odometry_figures, 
 from groundproc.estimation.adjustment.fine import refined
 from groundproc.estimation.adjustment.joining import joining
 from groundproc.estimation.adjustment.pace import Pace, Part
+from groundproc.estimation.adjustment.refuting import parted, slid_sigmas
 from groundproc.estimation.adjustment.run import Run
 from groundproc.estimation.adjustment.windows import (
     OVERLAP,
@@ -36,7 +37,7 @@ from groundproc.estimation.filtered import filtered_estimate
 from groundproc.estimation.method import Given, Method, Progress
 from groundproc.estimation.observations import observations_of
 from groundproc.estimation.observations.attitudes import attitude_track
-from groundproc.estimation.observations.fixes import position_track
+from groundproc.estimation.observations.fixes import SLID_SIGMAS, position_track
 from groundproc.estimation.observations.observation import Flown, Observation
 from groundproc.estimation.observations.rows import turned
 from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
@@ -172,6 +173,7 @@ def whole_run(
     """Adjust one run of the lidar's clock, and stream it once more for its motion between the knots (`fine`)."""
     part = Part(progress, 1.0 - REFINING)
     run = adjust_run(given, legs, number, start, part, more=more)
+    run.refuted = run.slides() and _refutes(start, run, given)
     if run.is_worse():
         part.rest("adjust")
         return run
@@ -232,6 +234,14 @@ def adjust_run(
         windows[-1].own = windows[-1].last - windows[-1].first
     pace.caught_up()
     return joined_run(windows, track, motion, sources)
+
+
+def _refutes(start: Trajectory, run: Run, given: Given) -> bool:
+    """Whether what a run began from agrees with the fixes, and moves elsewhere."""
+    antenna = np.zeros(3) if given.mount.gps_position_m is None else np.array(given.mount.gps_position_m)
+    fixes = [position_track(given, leg) for leg in given.placed]
+    made = run.trajectory(given, run.mount(given.mount))
+    return slid_sigmas(start, antenna, fixes) <= SLID_SIGMAS and parted(made, start)
 
 
 def firm(guide: Trajectory) -> Trajectory:

@@ -53,6 +53,8 @@ class Run:
     sources : Sources
     joined : Joined or None
         What the windows' joining found, where there is more than one.
+    refuted : bool
+        Whether what it began from agrees with the fixes and goes another way (`refuting`).
     """
 
     SIGMA_SOURCE: ClassVar = (
@@ -66,6 +68,7 @@ class Run:
     motion: Motion
     sources: Sources
     joined: Joined | None = None
+    refuted: bool = False
 
     def estimates(self) -> dict[str, tuple[Array, Array]]:
         """Globals over all windows: mean by their variances, and its sigma; what the joining found is that."""
@@ -185,8 +188,12 @@ class Run:
         return max(window.log[-1].get(SLID, 0.0) for window in self.windows)
 
     def is_misled(self) -> bool:
-        """Whether the odometry lost its way and the batch did not find it again: the path goes where the fixes do not."""
-        return self.track.restarts > 0 and self.slid_sigmas() > SLID_SIGMAS and not self.sources.leads()
+        """Whether the path goes where the fixes do not, and either the odometry lost its way or what it began from says so too."""
+        return (self.track.restarts > 0 or self.refuted) and self.slides() and not self.sources.leads()
+
+    def slides(self) -> bool:
+        """Whether the path slides away from the fixes that it believes."""
+        return self.slid_sigmas() > SLID_SIGMAS
 
     def is_worse(self) -> bool:
         """Whether what the adjustment began from is better than what it made of it."""

@@ -26,36 +26,37 @@ class SeenTrack:
         return len(self.matched)
 
 
-def run_with(restarts: int, slid: float, outside: tuple[str, ...]) -> Run:
+def run_with(restarts: int, slid: float, outside: tuple[str, ...], refuted: bool = False) -> Run:
     track: Any = SeenTrack(restarts)
     log = [{"chi_square": 0.2, "moved_m": 0.001, "position_drift": slid, "position_rms": 0.3}]
     windows: Any = [SimpleNamespace(log=log, told={})]
     unused: Any = None
     fixes = Fixes("fixes0", unused, 0, unused)
     sources: Any = SimpleNamespace(observations=[fixes], leads=lambda: bool(outside))
-    return Run(windows, unused, track, unused, sources)
+    return Run(windows, unused, track, unused, sources, refuted=refuted)
 
 
 @pytest.mark.parametrize(
-    ("restarts", "slid", "outside", "misled"),
+    ("restarts", "slid", "outside", "refuted", "misled"),
     [
-        (0, 2.0, (), False),
-        (1, 2.0, (), False),  # lost, and found again
-        (0, 2 * SLID_SIGMAS, (), False),  # a bad fix or two: the lidar was never lost
-        (1, 2 * SLID_SIGMAS, (), True),
-        (1, 2 * SLID_SIGMAS, ("ppk.pos",), False),  # better positions hold it
+        (0, 2.0, (), False, False),
+        (1, 2.0, (), False, False),  # lost, and found again
+        (0, 2 * SLID_SIGMAS, (), False, False),  # a bad fix or two: the lidar was never lost
+        (1, 2 * SLID_SIGMAS, (), False, True),
+        (0, 2 * SLID_SIGMAS, (), True, True),  # never lost, but the smoother goes with the fixes
+        (1, 2 * SLID_SIGMAS, ("ppk.pos",), True, False),  # better positions hold it
     ],
 )
-def test_misled_is_who_lost_the_way_and_ends_away_from_the_fixes(
-    restarts: int, slid: float, outside: tuple[str, ...], misled: bool
+def test_misled_is_who_ends_away_from_the_fixes_and_lost_the_way_or_is_refuted(
+    restarts: int, slid: float, outside: tuple[str, ...], refuted: bool, misled: bool
 ) -> None:
-    run = run_with(restarts, slid, outside)
+    run = run_with(restarts, slid, outside, refuted)
     assert run.is_misled() is misled
     if misled:  # is_blind is not asked first: the lidar saw planes enough
         assert "misled" in run.note()
         said = run.warnings()
         assert any("the trajectory is what the adjustment began from" in sentence for sentence in said)
-        assert any("lost its way" in sentence for sentence in said)
+        assert any("lost its way" in sentence for sentence in said) is (restarts > 0)
 
 
 @pytest.mark.parametrize("misled", [True, False])
