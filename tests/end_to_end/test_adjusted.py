@@ -211,7 +211,7 @@ def rms_of(found: Sequence[Judged], figure: str) -> float:
     return float(np.sqrt(np.mean([each.figures[figure] ** 2 for each in found])))
 
 
-# two flights of their own; in the quick suite the meadow's flat ground is held to the truth, and sigmas of the village's are
+# two flights of their own; in the quick suite: errors and sigmas of the village are held to the truth
 @pytest.mark.soak
 def test_over_a_flat_field_the_place_is_no_worse_than_the_autopilots(hovered: list[tuple[Judged, Judged]]) -> None:
     """Only height and tilt have a witness; the place is that of the smoother, and its sigma says so."""
@@ -229,6 +229,8 @@ def test_over_a_flat_field_the_heading_is_no_worse_than_the_autopilots(hovered: 
         assert np.median(each.estimate.trajectory.sigma_attitude_rad[:, 2]) > np.deg2rad(2.0)
 
 
+# one more whole adjustment; in the quick suite: how dark seconds are bridged (adjustment/test_bridging)
+@pytest.mark.soak
 def test_seconds_without_lidar_are_bridged_and_said(flight: Any, autopilots: Judged, tmp_path: Path) -> None:
     """4 s dark: what the inertial sensors carry on is off by their noise, 0.3 m/s^2 at 100 Hz and what is left of their bias."""
     log = tmp_path / "dark.mcap"

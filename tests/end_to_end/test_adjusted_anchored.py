@@ -147,6 +147,8 @@ def test_what_the_clocks_differ_by_is_found_with_the_positions(positioned: Made,
     assert source["positions"] > 90
 
 
+# one more whole adjustment; in the quick suite: a wild position does no harm (test_filtered), a blundered point is named (below)
+@pytest.mark.soak
 def test_a_wrong_fix_of_some_seconds_is_not_followed(flight: Any, tmp_path: Path) -> None:
     write_pos(flight.folder, tmp_path / "wrong.pos", SIGMA, np.random.default_rng(4), slice(40, 60))
     found = made(flight.folder, Survey(positions=str(tmp_path / "wrong.pos"), geoid=UNDULATION_M))

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import Judgement, judge
@@ -28,6 +29,8 @@ def judged(folder: Path, survey: Survey, solved: Estimate | None = None) -> tupl
         return made, judge([], truth, placed, made.mount)
 
 
+# a flight and a whole adjustment of its own; in the quick suite: the village is right to the sensor's noise (test_adjusted)
+@pytest.mark.soak
 def test_over_a_meadow_trees_and_tufts_hold_the_path(meadow_flight: Any, adjustment: Callable[[Any], Estimate]) -> None:
     """It was lost here by metres: noisy normals of the ground braked the take-off, and what is no plane counted for nothing.
 
@@ -46,6 +49,8 @@ def test_over_a_meadow_trees_and_tufts_hold_the_path(meadow_flight: Any, adjustm
     assert np.isfinite(made.trajectory.sigma_position_m).all()
 
 
+# the flight of the one above; in the quick suite: the village without the future (test_adjusted)
+@pytest.mark.soak
 def test_in_time_the_odometry_keeps_the_way_over_a_meadow(meadow_flight: Any) -> None:
     """Once the speed is known, some seconds after the start."""
     _, found = judged(meadow_flight.folder, Survey(method="adjusted", causal=True))

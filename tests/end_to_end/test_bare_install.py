@@ -130,7 +130,8 @@ def test_the_wheel_has_the_files_of_the_service(bare: Path) -> None:
     assert "WatchdogSec" in call(bare, "python", "-c", look)
 
 
-@pytest.mark.parametrize("where", ["base", "bare", "ground"])
+# the base alone is a third environment; what `bare` has besides, its commands' help does not use
+@pytest.mark.parametrize("where", [pytest.param("base", marks=pytest.mark.soak), "bare", "ground"])
 def test_both_commands_say_how_to_use_them(request: pytest.FixtureRequest, where: str) -> None:
     made: Path = request.getfixturevalue(where)
     assert "usage: swathd" in call(made, "swathd", "--help")
@@ -139,7 +140,8 @@ def test_both_commands_say_how_to_use_them(request: pytest.FixtureRequest, where
     assert {"process", "live", "pull", "simulate"} <= set(said.replace(",", " ").split())
 
 
-@pytest.mark.parametrize("where", ["base", "bare", "ground"])
+# the base alone is a third environment; what `bare` has besides, its commands' help does not use
+@pytest.mark.parametrize("where", [pytest.param("base", marks=pytest.mark.soak), "bare", "ground"])
 def test_what_is_installed_is_the_wheel_and_says_its_licence(request: pytest.FixtureRequest, where: str) -> None:
     look = (
         "import flightlog, importlib.metadata, json; found = importlib.metadata.distribution('swath');"
@@ -154,6 +156,8 @@ def test_what_is_installed_is_the_wheel_and_says_its_licence(request: pytest.Fix
     assert any(name.endswith("licenses/LICENSE") for name in found["files"])
 
 
+# the third environment, as above; in the quick suite all of flightlog is imported in `bare`
+@pytest.mark.soak
 def test_the_base_reads_a_flight_log(base: Path) -> None:
     call(base, "python", "-c", "import flightlog.logfile, flightlog.mavlink, flightlog.salvage, flightlog.dataflash")
 

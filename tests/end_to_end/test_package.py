@@ -97,6 +97,8 @@ def test_the_same_sources_make_the_same_bytes(debs: Path, tmp_path: Path) -> Non
     assert first.read_bytes() == second.read_bytes()
 
 
+# reads every file of both packages; in the quick suite: what is in them, and that they install and run
+@pytest.mark.soak
 @pytest.mark.skipif(shutil.which("lintian") is None, reason="lintian is not installed")
 def test_lintian_finds_nothing(debs: Path) -> None:
     done = subprocess.run(["lintian", "--allow-root", *debs.glob("swathd_0*.deb")], capture_output=True, text=True)

@@ -14,6 +14,8 @@ from groundproc.cli import main
 
 Array = npt.NDArray[np.float64]
 SIDE_M, EDGE_M, PER_M2 = 6.4, 0.1, 1100.0
+WITHOUT = pytest.param(False, marks=pytest.mark.soak)
+"""The same clouds once more; in the quick suite: boxes amid shrubs without trajectories (test_change_command)."""
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def flown() -> tuple[Array, Array, list[Pass], Echoes, Echoes]:
     return gone, new, lines, scan(before, lines, PER_M2, 1), scan(after, lines, PER_M2, 2)
 
 
-@pytest.mark.parametrize("beams", [False, True])
+@pytest.mark.parametrize("beams", [WITHOUT, True])
 def test_boxes_that_came_and_went_are_found_beside_shrubs_in_the_wind(
     tmp_path: Path, flown: tuple[Array, Array, list[Pass], Echoes, Echoes], beams: bool
 ) -> None:
@@ -68,7 +70,7 @@ def test_strips_of_one_flight_differ_by_nothing(
     assert claimed < 0.001 * seen
 
 
-@pytest.mark.parametrize("beams", [False, True])
+@pytest.mark.parametrize("beams", [WITHOUT, True])
 def test_sides_that_only_one_flight_saw_are_unseen(tmp_path: Path, beams: bool) -> None:
     # crates that stay, seen from lower lines, there in the one flight and across in the other; strips are off by some millimetres
     grid = np.stack(np.meshgrid(np.arange(1.0, 6.0, 1.4), np.arange(1.0, 6.0, 1.4)), axis=-1).reshape(-1, 2)

@@ -280,6 +280,8 @@ def test_with_one_imu_only(ordinary: list[Flown], change: Callable[[Flight], Non
     assert within.mean() > 0.9
 
 
+# a flight of its own; in the quick suite: with one of the two units only (above)
+@pytest.mark.soak
 def test_attitudes_at_10_hz_and_no_imu_at_all(simulated: Any) -> None:
     link = {"raw_sensors_hz": 0.0, "extra1_hz": 10.0}
     flight = simulated("filtered_attitude_only", "village", SECONDS, options(link=link), seed=1, every=10_000)
@@ -481,6 +483,8 @@ def test_poses_of_images_every_ten_seconds(ordinary: list[Flown]) -> None:
     assert rms_deg(found.attitude[:, 2]) < 1.0
 
 
+# 75 s of its own, the turn at a street's end; in the quick suite: no copter is taken for a car
+@pytest.mark.soak
 def test_a_car_is_told_from_a_copter(simulated: Any, ordinary: list[Flown]) -> None:
     # long enough for the turn at the street's end: without one there is nothing to tell it by
     flight = simulated("filtered_car", "facade", 75.0, options(), seed=1, every=10_000)

@@ -107,14 +107,20 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
     densities = np.full(NODES - 1, 1e-4), np.full(NODES - 1, 1e-2)
     start, covariance = 0.01 * rng.standard_normal(STATES), np.diag(rng.uniform(1e-3, 1e-1, STATES))
     correction, residual = np.empty((NODES, 9)), np.empty(len(rows[3]))
-    kept, variance, kept_covariance = np.empty((NODES, STATES)), np.empty((NODES, STATES)), np.empty((NODES, 9, 9))
+    kept, variance, kept_covariance = (
+        np.empty((NODES, STATES)),
+        np.empty((NODES, STATES)),
+        np.empty((NODES, 9, 9), np.float32),
+    )
     monkeypatch.setattr(kalman, "BLOCK", block)
     smooth = kalman.smooth if block == 400 else kalman.smooth.py_func
     if block != 400:
         for name in ("_forward", "_record", "_back"):
             monkeypatch.setattr(kalman, name, getattr(kalman, name).py_func)
     keep = np.tile(KEEP, (NODES - 1, 1))
-    motion = Motion(*reference, np.full(NODES - 1, STEP_S), angle, push, push, *densities, GRAVITY, keep, drive)
+    # arrays laid out as the method's own are: for others the whole smoother would be compiled once more
+    step_s, between = np.full(NODES - 1, STEP_S), np.asfortranarray(push)
+    motion = Motion(*reference, step_s, angle, push, between, *densities, GRAVITY, keep, drive)
     out = kalman.Smoothed(1, correction, residual, kept, kept_covariance, variance)
     smooth(motion, kalman.Rows(first, *rows), start, covariance, out)
     # all states of all nodes as one Gaussian vector, conditioned on all measurements at once

@@ -82,6 +82,8 @@ def test_each_picture_colours_what_it_sees_and_nothing_behind_it(place: Path) ->
     assert counts[3] < 0.01 * counts[2]
 
 
+# a scene of its own, ten thousands of leaves; in the quick suite: the hamlet with its trees (above)
+@pytest.mark.soak
 def test_in_a_grove_leaves_and_branches_hide_what_is_behind_them_and_nothing_beside(tmp_path: Path) -> None:
     """They are thinner than the points stand apart, and the ground is seen between them."""
     scene, rng = hamlet.grove(), np.random.default_rng(4)
@@ -187,7 +189,14 @@ def test_temperatures_are_right_to_a_kelvin_and_a_warm_car_that_passes_is_voted_
     assert (wrong > 1.0).mean() < 0.01
 
 
-@pytest.mark.parametrize("stated", [True, False], ids=["exposures in EXIF", "exposures nobody knows"])
+@pytest.mark.parametrize(
+    "stated",
+    [
+        # the other half of a block, drawn and laid once more; that EXIF is read is told by test_exposures
+        pytest.param(True, marks=pytest.mark.soak, id="exposures in EXIF"),
+        pytest.param(False, id="exposures nobody knows"),
+    ],
+)
 def test_the_index_is_right_to_two_hundredths_whether_or_not_exposures_are_known(
     place: Path, tmp_path: Path, stated: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,8 @@ from groundproc.cli import main
 
 Array = npt.NDArray[np.float64]
 
+SOAK = pytest.mark.soak
+"""A second strength of what the first has told already: five strips and their echoes each."""
 PANELS = {"dark": 0.046, "grey": 0.303, "white": 0.813}
 
 
@@ -139,7 +141,7 @@ def defocused(range_m: Any, lost: float, near_m: float) -> Any:
     return 1.0 - lost * np.exp(-((range_m / near_m) ** 2))
 
 
-@pytest.mark.parametrize(("lost", "near_m"), [(0.45, 6.0), (0.25, 12.0)])
+@pytest.mark.parametrize(("lost", "near_m"), [(0.45, 6.0), pytest.param(0.25, 12.0, marks=SOAK)])
 def test_what_a_sensor_loses_near_by_is_found_from_strips_that_overlap(
     tmp_path: Path, lost: float, near_m: float
 ) -> None:
@@ -265,7 +267,7 @@ def wood(exponent: float, seed: int = 7) -> tuple[Scene, dict[str, Any]]:
     return made, {name: values[order] for name, values in whole.items()}
 
 
-@pytest.mark.parametrize("exponent", [0.8, -0.5, 0.0])
+@pytest.mark.parametrize("exponent", [0.8, pytest.param(-0.5, marks=SOAK), 0.0])
 def test_strips_of_a_wood_agree_from_border_to_border(tmp_path: Path, exponent: float) -> None:
     made, echoes = wood(exponent)
     found, told = run(tmp_path, made, echoes, "--intensity", "compensated")

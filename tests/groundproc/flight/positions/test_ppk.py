@@ -39,7 +39,7 @@ def run(world: Any, tmp_path: Path) -> Callable[..., Path]:
     return call
 
 
-@pytest.mark.parametrize("slips_each_s", [0.0, 0.01])
+@pytest.mark.parametrize("slips_each_s", [0.0, pytest.param(0.01, marks=pytest.mark.soak)])  # five skies each
 def test_fixes_are_the_known_path_within_their_sigmas(
     make_world: Callable[..., Any], tmp_path: Path, slips_each_s: float
 ) -> None:
