@@ -19,7 +19,7 @@ import seeds
 from flightlog.logwriter import LogWriter
 from groundproc.cli import main
 
-EACH = 3
+EACH = 2
 """Spoilt files for each door in every run of the tests."""
 SOAK_S = 600.0
 MEMORY_BYTES = 1 << 30

@@ -132,12 +132,12 @@ def _painted(name: str) -> scenes.Texture:
 @pytest.mark.parametrize(
     "name", ["asphalt", "line", "edge", "corner", "junction", "crossing", "zebra", "dash", "square"]
 )
-def test_road_markings_are_no_targets(name: str) -> None:
-    for seed, per_m2 in ((1, 150.0), (2, 500.0)):
-        rng = np.random.default_rng(seed)
-        texture = scenes.placed(_painted(name), tuple(rng.uniform(-0.3, 0.3, 2)), rng.uniform(0, np.pi))
-        found = looked_for([scenes.ground(texture)], np.zeros(3), per_m2, seed)
-        assert isinstance(found, Missing), (name, found)
+@pytest.mark.parametrize(("seed", "per_m2"), [(2, 500.0), pytest.param(1, 150.0, marks=pytest.mark.soak)])
+def test_road_markings_are_no_targets(name: str, seed: int, per_m2: float) -> None:
+    rng = np.random.default_rng(seed)
+    texture = scenes.placed(_painted(name), tuple(rng.uniform(-0.3, 0.3, 2)), rng.uniform(0, np.pi))
+    found = looked_for([scenes.ground(texture)], np.zeros(3), per_m2, seed)
+    assert isinstance(found, Missing), (name, found)
 
 
 def test_two_targets_side_by_side_are_not_chosen_between() -> None:

@@ -129,13 +129,16 @@ def test_captures_are_joined_in_the_order_of_time(
         assert chunks(log, topic) == chunks(monterey_log, topic)
 
 
+# at every byte that is two thousand imports; bytes within one packet are alike, and the edges are in both
+@pytest.mark.parametrize("step", [13, pytest.param(1, marks=pytest.mark.soak)])
 def test_a_capture_cut_at_any_byte_gives_a_log_of_what_is_whole_or_one_sentence(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    step: int, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = small.read_bytes()
     cut, log = tmp_path / "cut.pcap", tmp_path / "cut.mcap"
     ends = [24, 24 + 16 + 1248, 24 + 32 + 1248 + 554]
-    for size in range(len(content)):
+    edges = {end + off for end in (*ends, len(content)) for off in (-17, -16, -1, 0, 1, 15, 16, 17)}
+    for size in sorted({*range(0, len(content), step), *range(41), *edges} & {*range(len(content))}):
         cut.write_bytes(content[:size])
         code, said = run(capsys, "--pcap", cut, "-o", log, "--force")
         whole = sum(end <= size for end in ends[1:])
