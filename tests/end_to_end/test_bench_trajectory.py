@@ -59,24 +59,19 @@ def test_figures_table_and_pictures_of_a_short_flight(judged_flight: Any, tmp_pa
         assert (out / f"{name}.png").stat().st_size > 10_000, name
 
 
-def test_a_method_that_fails_says_why_and_the_others_go_on(
-    judged_flight: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_method_that_fails_says_why_and_the_others_go_on(judged_flight: Any, tmp_path: Path) -> None:
     import trajectory
 
-    def run(log: Path, method: str, out: Path) -> int:
-        return trajectory.main(["--log", str(log), "--cold", "--methods", method, "--out", str(out)])
-
     with pytest.raises(SystemExit, match="slam"):
-        run(judged_flight.folder, "slam", tmp_path)
+        trajectory.main(["--methods", "slam", "--log", str(judged_flight.folder), "--cold", "--out", str(tmp_path)])
     log = tmp_path / "flight"
     log.mkdir()
     for name in ("truth.csv", "truth.json", "truth_points.npy"):
         (log / name).symlink_to(judged_flight.folder / name)
     (log / "flight.mcap").write_bytes((judged_flight.folder / "flight.mcap").read_bytes()[:3000])
-    capsys.readouterr()
-    assert run(log, "ins", tmp_path / "results") == 1
-    figures = json.loads(capsys.readouterr().out.splitlines()[-1])["ins"]
+    done = bench("--log", log, "--cold", "--methods", "ins", "--out", tmp_path / "results")
+    assert done.returncode == 1
+    figures = json.loads(done.stdout.splitlines()[-1])["ins"]
     assert figures["ate_m"] is None
     assert "flight.mcap" in figures["error"]
 

@@ -94,7 +94,10 @@ def test_reflectances_are_those_of_the_source():
         assert low <= TABLE[INDEX[name]].reflectance <= high
 
 
-@pytest.mark.parametrize("name", SCENES)
+# the town is much the largest, and no flight of the quick suite goes there
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.soak if name == "town" else ()) for name in SCENES]
+)
 def test_no_route_touches_anything(name):
     for route in SCENES[name][0](generator(1, "x"))[1]:
         assert_clear(name, route, 480.0 if route == "patrol" else 120.0)

@@ -58,7 +58,7 @@ def error_in_sigmas(found: Registration, turn: Rotation, shift: Array) -> Array:
     return np.asarray(np.concatenate([shift_left, turned]) / np.sqrt(np.diag(found.covariance)))
 
 
-@pytest.mark.parametrize("bushes", [0, 4])
+@pytest.mark.parametrize("bushes", [pytest.param(0, marks=pytest.mark.soak), 4])  # four registrations each
 def test_errors_of_a_registration_are_of_the_size_of_its_sigmas(bushes: int) -> None:
     turn, shift = Rotation.from_rotvec(np.radians([0.05, -0.1, 0.2])), np.array([0.03, -0.02, 0.015])
     errors = []
