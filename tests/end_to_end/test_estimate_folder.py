@@ -37,8 +37,8 @@ def log(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def thin(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One tenth of a second of points in twenty, for what any point tells."""
-    return begun(flight, tmp_path_factory.mktemp("thin") / "flight.mcap", every=20)
+    """One tenth of a second of points in five, for what any point tells."""
+    return begun(flight, tmp_path_factory.mktemp("thin") / "flight.mcap", every=5)
 
 
 def begun(flight: Any, path: Path, every: int = 1) -> Path:

@@ -26,7 +26,7 @@ from groundproc.trajectory.table import read_trajectory
 Array = npt.NDArray[np.float64]
 
 SWATH = [sys.executable, "-c", "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"]
-FLIGHT_S = 20.0
+FLIGHT_S = 18.0
 START_S = 5.0
 """What the start may take: 3 s of clocks and gyros, and the searches for them."""
 POSITION_RMS_M = 0.05
@@ -34,9 +34,8 @@ POSITION_RMS_M = 0.05
 
 
 @pytest.fixture(scope="module")
-def flight(house_flight: Any) -> Any:
-    """The flight of the adjustment's tests: with every firing it takes longest to make."""
-    return house_flight
+def flight(live_flight: Any) -> Any:
+    return live_flight
 
 
 def free_port(kind: int = socket.SOCK_DGRAM) -> int:
