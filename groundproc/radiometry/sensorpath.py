@@ -32,6 +32,9 @@ _MOST_RAYS: Final = 60_000
 _FEWEST_RAYS: Final = 200
 _LEAST_ANGLE: Final = 0.02
 """Rays of a strip have to differ by so much [rad], or they tell no height."""
+_FEWEST_PARALLEL: Final = 20
+_PARALLEL_M: Final = 1000.0
+"""Where rays tell the direction to the sensor alone, it is put so far away."""
 _FARTHEST_M: Final = 20_000.0
 _ROUNDS: Final = 10
 _SOME: Final = 1000
@@ -254,8 +257,13 @@ class Rays:
         )
         self._parts.append(rays)
 
-    def path(self) -> Seen:
+    def path(self, *, directions: bool = False) -> Seen:
         """The sensor's path.
+
+        Parameters
+        ----------
+        directions : bool
+            It is asked for the directions of beams alone: where rays are parallel or few, the path lies far away along them.
 
         Raises
         ------
@@ -268,7 +276,8 @@ class Rays:
             own = rays[rays[:, 0] == number]
             own = own[np.argsort(own[:, 1], kind="stable")]
             parts = np.split(own, np.flatnonzero(np.diff(own[:, 1]) > _GAP_S) + 1)
-            found = [leg for leg in map(_leg, parts) if leg is not None]
+            told = [_leg(part) or (_along(part) if directions else None) for part in parts]
+            found = [leg for leg in told if leg is not None]
             if found:
                 legs[int(number)] = found
         if not legs:
@@ -280,16 +289,29 @@ class Rays:
 
 
 def recovered(cloud: Cloud) -> Seen | None:
-    """The path that a cloud itself tells; None where it does not."""
+    """The path that a cloud itself tells, as far as the directions of its beams go; None where it does not."""
     if not cloud.timed:
         return None
     rays = Rays()
     for chunk in reader.chunks(cloud, columns=()):
         rays.add(chunk)
     try:
-        return rays.path()
+        return rays.path(directions=True)
     except CoverageError:
         return None
+
+
+def _along(rays: Array) -> Leg | None:
+    """A straight path far away along the rays of a strip; None: they are too few."""
+    if len(rays) < _FEWEST_PARALLEL:
+        return None
+    time_s, low = rays[:, 1], rays[:, 5:8]
+    way = (rays[:, 2:5] - low).sum(axis=0)  # the longer ones tell more
+    there = low + _PARALLEL_M * way / np.linalg.norm(way)
+    ends_s = np.array([time_s[0], max(time_s[-1], time_s[0] + 0.1)])
+    rows = np.column_stack([np.ones(len(time_s)), time_s - ends_s[0]])
+    (place, speed), *_ = np.linalg.lstsq(rows, there, rcond=None)
+    return Leg(ends_s, place + speed * (ends_s - ends_s[0])[:, None])
 
 
 def _leg(rays: Array) -> Leg | None:
