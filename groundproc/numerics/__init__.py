@@ -1,4 +1,4 @@
-"""Arrays in, arrays out: no file, clock, log or flight, and no other room.
+"""Arrays in, arrays out: no file, clock, log or flight, and no other room but the one that shares work out between cores.
 
 rotations   quaternions, rotation vectors and matrices inside kernels
 splines     uniform cubic B-splines
@@ -7,6 +7,8 @@ voxelhash   keys of voxels, and points sorted by them
 planes      planes through the second moments of points
 memory      arrays whose memory is used again
 planerows   distances from such planes as rows of a least-squares problem, the planes solved for within
+planeproducts  the normal matrix of such rows times vectors
+filters     low-pass, spectrum and peaks of evenly spaced series
 
 Kernels take few arguments: what belongs together is a named tuple of arrays, whose fields have shape, dtype and unit in its docstring. A
 dataclass that kernels work on has a property `arrays` that makes one. They unpack it once, above their loops.

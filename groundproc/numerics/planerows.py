@@ -6,12 +6,14 @@ remains couples all clusters of the voxel, however far apart in time; it is neve
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
+from groundproc.machine.readahead import at_once
+from groundproc.numerics.planeproducts import ABREAST, RowArrays, products, products_abreast, row_times, solved_plane
 from groundproc.numerics.planes import Placed, VoxelPlanes, axes_along
 
 Array = npt.NDArray[np.float64]
@@ -28,19 +30,6 @@ PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
 _NOTHING: Final = np.empty(0)
 _NO_VECTOR: Final = np.empty((0, 6))
-
-
-class RowArrays(NamedTuple):
-    """The arrays of `PlaneRows`, as kernels take them; their meaning, shapes and units stand there."""
-
-    first: Ints
-    knot: npt.NDArray[np.int32]
-    weights: Singles
-    jacobian: Singles
-    plane: Singles
-    weight: Array
-    residual_m: Array
-    inverse: Array
 
 
 @dataclass(slots=True)
@@ -149,9 +138,34 @@ class PlaneRows:
         return self._products(_NO_VECTOR, values_m, projected), projected
 
     def _products(self, vector: Array, values_m: Array, projected: Array = _NOTHING) -> Array:
-        out = np.zeros((PARTS, self.path_size))
-        _products(self.arrays, vector, values_m, out, projected)
-        return np.asarray(out.sum(axis=0))
+        out = np.zeros((PARTS, self.intervals + 3, 6))
+        arrays = self.arrays
+        at_once(lambda part: products(arrays, self._part(part), vector, values_m, out[part], projected), PARTS)
+        return np.asarray(out.sum(axis=0).ravel())
+
+    def apply_all(self, vectors: Array) -> Array:
+        """The normal matrix times several vectors, shape (path_size, m)."""
+        size, count = vectors.shape
+        blocks = -(-count // ABREAST)
+        padded = np.zeros((size, blocks * ABREAST))
+        padded[:, :count] = vectors
+        some = np.ascontiguousarray(padded.reshape(size, blocks, ABREAST).swapaxes(0, 1)).reshape(
+            blocks, -1, 6, ABREAST
+        )
+        out, arrays = np.zeros((PARTS, *some.shape)), self.arrays
+
+        def multiply(part: int) -> None:
+            for block in range(blocks):
+                products_abreast(arrays, self._part(part), some[block], out[part, block])
+
+        at_once(multiply, PARTS)
+        found = out.sum(axis=0).reshape(blocks, size, ABREAST).swapaxes(0, 1)
+        return np.asarray(found.reshape(size, -1)[:, :count])
+
+    def _part(self, number: int) -> tuple[int, int]:
+        """One of `PARTS` pieces of the voxels: the first, and the one after the last."""
+        voxels = len(self.first) - 1
+        return voxels * number // PARTS, voxels * (number + 1) // PARTS
 
     def along(self, vector: Array) -> Array:
         """The rows times a vector of unknowns, shape (n,)."""
@@ -268,71 +282,12 @@ def _fit(v: int, rows: RowArrays, prior: float) -> Any:
     return solved_plane(inverse, r0, r1, r2)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def solved_plane(q: Array, r0: float, r1: float, r2: float) -> Any:
-    """Offset and tilts of a plane by the inverse of its normal matrix, shape (6,), and its right side."""
-    return q[0] * r0 + q[1] * r1 + q[2] * r2, q[1] * r0 + q[3] * r1 + q[4] * r2, q[2] * r0 + q[4] * r1 + q[5] * r2
-
-
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _products(rows: RowArrays, vector: Array, values: Array, out: Array, projected: Array) -> None:
-    """Columns times values of the rows, weighed and less the best plane of each voxel: in parts, shape (parts, unknowns).
-
-    Where no values are given, shape (0,), they are the rows times a vector, shape (coefficients, 6). What is left of the values less
-    their planes, weighed, is told in `projected`, unless that has the shape (0,).
-    """
-    first, knot, weights, jacobian = rows.first, rows.knot, rows.weights, rows.jacobian
-    plane, weight, inverse = rows.plane, rows.weight, rows.inverse
-    voxels, given, told = len(first) - 1, len(values) > 0, len(projected) > 0
-    for part in prange(PARTS):
-        mine = out[part].reshape(-1, 6)
-        scratch = np.empty(64)
-        for v in range(voxels * part // PARTS, voxels * (part + 1) // PARTS):
-            start, end = first[v], first[v + 1]
-            if end - start > len(scratch):
-                scratch = np.empty(2 * (end - start))
-            r0, r1, r2 = 0.0, 0.0, 0.0
-            for i in range(start, end):
-                y = values[i] if given else _row(i, knot, weights, jacobian, vector)
-                scratch[i - start] = y
-                y *= weight[i]
-                r0 += y
-                r1 += y * plane[i, 0]
-                r2 += y * plane[i, 1]
-            d, a, b = solved_plane(inverse[v], r0, r1, r2)
-            for i in range(start, end):
-                y = weight[i] * (scratch[i - start] - d - a * plane[i, 0] - b * plane[i, 1])
-                if told:
-                    projected[i] = y
-                k = knot[i]
-                w0, w1, w2, w3 = y * weights[i, 0], y * weights[i, 1], y * weights[i, 2], y * weights[i, 3]
-                for c in range(6):
-                    j = jacobian[i, c]
-                    mine[k, c] += w0 * j
-                    mine[k + 1, c] += w1 * j
-                    mine[k + 2, c] += w2 * j
-                    mine[k + 3, c] += w3 * j
-
-
-@njit(cache=True, nogil=True, inline="always", fastmath=True)
-def _row(i: int, knot: npt.NDArray[np.int32], weights: Singles, jacobian: Singles, vector: Array) -> float:
-    """One row times a vector."""
-    k = knot[i]
-    w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
-    y = 0.0
-    for c in range(6):
-        y += jacobian[i, c] * (
-            w0 * vector[k, c] + w1 * vector[k + 1, c] + w2 * vector[k + 2, c] + w3 * vector[k + 3, c]
-        )
-    return y
-
-
 @njit(cache=True, nogil=True, fastmath=True)
 def _along(rows: RowArrays, vector: Array, out: Array) -> None:
     """Each row times a vector of the path's unknowns."""
     knot, weights, jacobian = rows.knot, rows.weights, rows.jacobian
     for i in range(len(knot)):
-        out[i] = _row(i, knot, weights, jacobian, vector)
+        out[i] = row_times(i, knot, weights, jacobian, vector)
 
 
 @njit(cache=True, nogil=True)

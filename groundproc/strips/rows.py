@@ -12,7 +12,8 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog import frames
-from groundproc.numerics.planerows import PlaneRows, RowArrays, solved_plane
+from groundproc.numerics.planeproducts import RowArrays, solved_plane
+from groundproc.numerics.planerows import PlaneRows
 from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
 from groundproc.numerics.voxelhash import voxel_key
 from groundproc.strips.correction import Correction

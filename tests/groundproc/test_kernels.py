@@ -34,7 +34,7 @@ def parameters(node: ast.FunctionDef) -> list[ast.arg]:
 
 
 def test_kernels_are_found() -> None:
-    assert {"numerics/planerows.py:_products", "estimation/inertial/kalman.py:smooth"} <= {
+    assert {"numerics/planeproducts.py:products", "estimation/inertial/kalman.py:smooth"} <= {
         name for name, _ in kernels()
     }
 

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
@@ -20,8 +20,9 @@ from flightlog import frames
 from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
+from groundproc.machine.readahead import at_once
 from groundproc.numerics import splines
-from groundproc.numerics.planerows import RowArrays, solved_plane
+from groundproc.numerics.planeproducts import RowArrays, solved_plane
 
 Array = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
@@ -166,41 +167,42 @@ def lidar_between(rows: Rows, nodes: Nodes) -> Array:
     """The lidar's normal matrix between nodes, shape (6 nodes, 6 nodes)."""
     count = len(nodes.centre_m)
     upper = np.zeros((COARSE_PARTS, count, count, 6, 6))
-    _reduce(rows.arrays, nodes.arrays, upper)
+    arrays, places, voxels = rows.arrays, nodes.arrays, len(rows.first) - 1
+
+    def reduce(part: int) -> None:
+        some = voxels * part // COARSE_PARTS, voxels * (part + 1) // COARSE_PARTS
+        _reduce(arrays, places, some, upper[part])
+
+    at_once(reduce, COARSE_PARTS)
     upper[0] += upper[1:].sum(axis=0)
     square = upper[0].transpose(0, 2, 1, 3).reshape(6 * count, 6 * count)
     return np.asarray(np.triu(square) + np.triu(square, 1).T)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _reduce(rows: RowArrays, nodes: NodeArrays, out: Array) -> None:
-    """Blocks on and above the diagonal, in parts: shape (parts, nodes, nodes, 6, 6)."""
+@njit(cache=True, nogil=True, fastmath=True)
+def _reduce(rows: RowArrays, nodes: NodeArrays, voxels: tuple[int, int], out: Array) -> None:
+    """Blocks on and above the diagonal, of the voxels from a first one to before a last one: shape (nodes, nodes, 6, 6)."""
     first, knot, weights, jacobian = rows.first, rows.knot, rows.weights, rows.jacobian
     plane, weight, inverse = rows.plane, rows.weight, rows.inverse
-    every, mats, position, centre = nodes.every, nodes.mats, nodes.position_m, nodes.centre_m
-    voxels = len(first) - 1
-    parts, count_nodes = out.shape[0], out.shape[1]
-    for part in prange(parts):
-        mine = out[part]
-        at = NodeArrays(every, mats, position, centre)
-        slot, touched = np.full(count_nodes, -1), np.empty(count_nodes, np.int64)
-        sums, solved, by = np.empty((count_nodes, 3, 6)), np.empty((3, 6)), np.empty((3, 6))
-        for v in range(voxels * part // parts, voxels * (part + 1) // parts):
-            count = 0
-            for i in range(first[v], first[v + 1]):
-                if weight[i] == 0.0:
-                    continue
-                node = knot[i] // every
-                last = _by_nodes(knot[i], node, weights[i], jacobian[i], at, by)
-                for a in range(last + 1):
-                    if slot[node + a] < 0:
-                        slot[node + a], touched[count] = count, node + a
-                        sums[count] = 0.0
-                        count += 1
-                    _add_row(weight[i], by[a : last + 1], plane[i], sums[slot[node + a]], mine[node + a, node + a :])
-            _without_planes(touched[:count], sums, inverse[v], solved, mine)
-            for a in range(count):
-                slot[touched[a]] = -1
+    count_nodes = len(out)
+    slot, touched = np.full(count_nodes, -1), np.empty(count_nodes, np.int64)
+    sums, solved, by = np.empty((count_nodes, 3, 6)), np.empty((3, 6)), np.empty((3, 6))
+    for v in range(voxels[0], voxels[1]):
+        count = 0
+        for i in range(first[v], first[v + 1]):
+            if weight[i] == 0.0:
+                continue
+            node = knot[i] // nodes.every
+            last = _by_nodes(knot[i], node, weights[i], jacobian[i], nodes, by)
+            for a in range(last + 1):
+                if slot[node + a] < 0:
+                    slot[node + a], touched[count] = count, node + a
+                    sums[count] = 0.0
+                    count += 1
+                _add_row(weight[i], by[a : last + 1], plane[i], sums[slot[node + a]], out[node + a, node + a :])
+        _without_planes(touched[:count], sums, inverse[v], solved, out)
+        for a in range(count):
+            slot[touched[a]] = -1
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath=True)

@@ -9,7 +9,8 @@ The path's slow part is the batch's and stays: errors are taken to be those of a
 (Ornstein and Uhlenbeck). Where the lidar sees nothing the path stays as it is. Positions are not touched.
 """
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -24,6 +25,7 @@ from groundproc.estimation.odometry.odometry import Odometry
 from groundproc.estimation.odometry.slices import Clusterer, Slice
 from groundproc.estimation.odometry.spline import Path, PathArrays
 from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, TILT, MapArrays, PlaneMap, find
+from groundproc.machine.readahead import ahead
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.voxelhash import voxel_key
 
@@ -66,26 +68,38 @@ def refined(path: Path, pieces: Iterable[Slice], grid_ns: int, density: float, v
         Edge of the voxels whose planes make the map.
     """
     turns = np.zeros((len(path.quat), 3))
-    cluster = Clusterer(voxel_m)
     clusters: list[npt.NDArray[np.void]] = []
     planes, first, last = PlaneMap(voxel_m), 0, 0
-    for piece in pieces:
-        at = int((grid_ns + piece.number * SLICE_NS - path.start_ns) // STEP_NS)
-        if at < first or at + STEPS >= len(turns) or not len(piece.xyz_m):
-            continue
-        if clusters and at - first >= CHUNK * STEPS:
-            _turn(path, slice(first, last), turns, clusters, planes, density)
-            clusters, planes = [], PlaneMap(voxel_m)
-        if not clusters:
-            first = at
-        last = at + STEPS + 1
-        start_ns = path.start_ns + at * STEP_NS
-        found, world = cluster(piece, start_ns, path.quat[at:last], path.position_m[at:last])
-        planes.insert(world, found, Odometry.MOST)
-        clusters.append(found[["time_ns", "xyz", "count"]].copy())
+    with contextlib.closing(ahead(_clustered(path, pieces, grid_ns, Clusterer(voxel_m)))) as made:
+        for at, found, world in made:
+            if at < first:
+                continue
+            if clusters and at - first >= CHUNK * STEPS:
+                _turn(path, slice(first, last), turns, clusters, planes, density)
+                clusters, planes = [], PlaneMap(voxel_m)
+            if not clusters:
+                first = at
+            last = at + STEPS + 1
+            planes.insert(world, found, Odometry.MOST)
+            clusters.append(found[["time_ns", "xyz", "count"]].copy())
     if clusters:
         _turn(path, slice(first, last), turns, clusters, planes, density)
     return replace(path, quat=frames.quat_multiply(path.quat, frames.quat_exp(turns)))
+
+
+def _clustered(
+    path: Path, pieces: Iterable[Slice], grid_ns: int, cluster: Clusterer
+) -> Iterator[tuple[int, npt.NDArray[np.void], Array]]:
+    """Clusters of the slices that the path covers, in order, where it places them, and the grid step at which each slice begins.
+
+    They do not depend on the map, and so are made while it takes those before.
+    """
+    for piece in pieces:
+        at = int((grid_ns + piece.number * SLICE_NS - path.start_ns) // STEP_NS)
+        if at < 0 or at + STEPS >= len(path.quat) or not len(piece.xyz_m):
+            continue
+        start_ns, here = path.start_ns + at * STEP_NS, slice(at, at + STEPS + 1)
+        yield at, *cluster(piece, start_ns, path.quat[here], path.position_m[here])
 
 
 def _turn(

@@ -103,11 +103,11 @@ class Posterior:
     def spread(self, count: int, seed: int = 1) -> Spread:
         """So many draws of the error of the solution, noise put through the same solution; and what need not be drawn."""
         rng = np.random.default_rng(seed)
-        whole, anchored = np.empty((2, count, self.unknowns.size))
+        rights, of_anchors = np.empty((2, self.unknowns.size, count))
         for i in range(count):
-            right, of_anchors = self.noise.draw(rng)
-            whole[i] = self.told(self.problem.solve(right, 0.0, ENOUGH_OF_DRAWS)[0])
-            anchored[i] = self.told(self.problem.coarse.solve(of_anchors))
+            rights[:, i], of_anchors[:, i] = self.noise.draw(rng)
+        whole = self.told(self.problem.solve_all(rights, 0.0, ENOUGH_OF_DRAWS)).T
+        anchored = self.told(self.problem.coarse.solve(of_anchors)).T
         if self.problem.wide is not None:  # control holds the whole, and the coarse path does not know of it
             return Spread(whole, 0.0 * anchored, np.zeros((0, self.unknowns.size)))
         return Spread(whole, anchored, self.told(self.problem.coarse.spread_by(self.noise.anchors)).T)
@@ -139,14 +139,14 @@ class Posterior:
         """Covariance of some globals, without drawing, shape (m, m); of the whole's turn and shift as `told`."""
         places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
         whole, common = self._whole(), self._common()
-        seen = []
-        for place in places:
-            right = np.zeros(self.unknowns.size)
-            right[place] = 1.0
+        rights = np.zeros((self.unknowns.size, len(places)))
+        for i, place in enumerate(places):
+            rights[place, i] = 1.0
             if place in whole:  # with what the path's coefficients have of it
-                right[: common.shape[1]] = common[int(np.flatnonzero(whole == place)[0])]
-            seen.append(self.noise.seen(self.problem.solve(right, 0.0, ENOUGH_OF_COLUMNS)[0]))
-        return np.asarray(np.array(seen) @ np.array(seen).T)
+                rights[: common.shape[1], i] = common[int(np.flatnonzero(whole == place)[0])]
+        solved = self.problem.solve_all(rights, 0.0, ENOUGH_OF_COLUMNS)
+        seen = np.array([self.noise.seen(column) for column in np.ascontiguousarray(solved.T)])
+        return np.asarray(seen @ seen.T)
 
     def datum(self) -> Array:
         """Covariance of the shift and of the turn about the origin that all of a path shares, shape (6, 6).

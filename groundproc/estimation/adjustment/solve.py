@@ -64,11 +64,18 @@ class Problem:
 
     def apply(self, vector: Array) -> Array:
         """The whole normal matrix times a vector."""
-        size = self.rows.size
+        return self._with_others(vector, self.rows.apply(vector[: self.rows.size]))
+
+    def apply_all(self, vectors: Array) -> Array:
+        """The same of several vectors, shape (unknowns, m)."""
+        return self._with_others(vectors, self.rows.apply_all(vectors[: self.rows.size]))
+
+    def _with_others(self, vector: Array, of_lidar: Array) -> Array:
+        """The whole normal matrix times vectors, of what that of the lidar makes of them."""
         out = self.normal @ vector
         if self.wide is not None:
             out += self.wide.rows.T @ (self.wide.rows @ vector)
-        out[:size] += self.rows.apply(vector[:size]) / self.deflation
+        out[: self.rows.size] += of_lidar / self.deflation
         return np.asarray(out)
 
     def solve(self, right: Array, enough: float = ENOUGH, share: float = 0.0) -> tuple[Array, int]:
@@ -95,8 +102,40 @@ class Problem:
             p = z + (rz / before) * p
         return x, MOST_STEPS
 
+    def solve_all(self, rights: Array, enough: float = ENOUGH, share: float = 0.0) -> Array:
+        """`solve` of several right sides, shape (unknowns, m), each by itself and all side by side: the rows are read once for all."""
+        found = np.zeros_like(rights)
+        going = np.arange(rights.shape[1])
+        x, r = np.zeros_like(rights), rights.copy()
+        z = self.near(r)
+        p, rz = z.copy(), (r * z).sum(axis=0)
+        gains: list[Array] = []
+        for step in range(1, MOST_STEPS + 1):
+            if step >= 1 + DELAY_STEPS:
+                done = sum(gains[-DELAY_STEPS:]) < np.maximum(enough, share * sum(gains))
+                done |= rz <= 0.0
+            else:
+                done = rz <= 0.0  # solved to the last digit
+            if done.any():
+                found[:, going[done]] = x[:, done]
+                left = ~done
+                going, x, r, z, p, rz = going[left], x[:, left], r[:, left], z[:, left], p[:, left], rz[left]
+                gains = [gain[left] for gain in gains]
+                if not len(going):
+                    return found
+            image = self.apply_all(p)
+            alpha = rz / (p * image).sum(axis=0)
+            x += alpha * p
+            r -= alpha * image
+            gains.append(alpha * rz)
+            z = self.near(r)
+            before, rz = rz, (r * z).sum(axis=0)
+            p = z + (rz / before) * p
+        found[:, going] = x
+        return found
+
     def near(self, right: Array) -> Array:
-        """The preconditioner: nearly the inverse times a vector."""
+        """The preconditioner: nearly the inverse times a vector, or times several, shape (unknowns, m)."""
         found = self.factor.solve(right) + self.coarse.solve(right)
         return np.asarray(found if self.wide is None else self.wide.bordered(found))
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.numerics.planerows import RowArrays, solved_plane
+from groundproc.numerics.planeproducts import RowArrays, solved_plane
 from groundproc.sensors.lasers import LaserCorrections
 from groundproc.sensors.shots import LaserTable
 

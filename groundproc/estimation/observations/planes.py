@@ -14,7 +14,8 @@ from groundproc.estimation.observations.told import Poses, keep_told
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path, PathArrays
-from groundproc.numerics.planerows import PlaneRows, RowArrays
+from groundproc.numerics.planeproducts import RowArrays
+from groundproc.numerics.planerows import PlaneRows
 from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.splines import basis
@@ -61,6 +62,14 @@ class Rows(PlaneRows):
         if not self.more:
             return out
         return np.concatenate([out + further @ self.border, self.border @ path + self.corner @ further])
+
+    def apply_all(self, vectors: Array) -> Array:
+        """The same of several vectors, shape (size, m)."""
+        path, further = vectors[: self.path_size], vectors[self.path_size :]
+        out = PlaneRows.apply_all(self, path)
+        if not self.more:
+            return out
+        return np.concatenate([out + self.border.T @ further, self.border @ path + self.corner @ further])
 
     def spread(self, values_m: Array) -> Array:
         """The columns of all unknowns times values of the rows, shape (n,), weighed and less the best plane of each voxel."""

@@ -14,7 +14,8 @@ from scipy.ndimage import uniform_filter1d
 
 from groundproc.estimation.odometry.matching import FACING_VOXELS, GROUND, INFLATION, RELIEF, TELLS_M, observable
 from groundproc.numerics.facing import mean_normals
-from groundproc.numerics.planerows import PlaneRows, RowArrays
+from groundproc.numerics.planeproducts import RowArrays
+from groundproc.numerics.planerows import PlaneRows
 
 Array = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
