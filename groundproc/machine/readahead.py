@@ -123,29 +123,6 @@ def beside(works: Sequence[Callable[[], object]]) -> None:
         raise errors[0]
 
 
-def at_once(work: Callable[[int], object], count: int) -> None:
-    """Do `work` of 0 to `count` - 1, shared out between the cores: the first here, and all where there is one core."""
-    threads = min(cores(), count)
-    errors: list[BaseException] = []
-
-    def do(first: int) -> None:
-        try:
-            for number in range(first, count, threads):
-                if not errors:
-                    work(number)
-        except BaseException as raised:  # whatever it is, it is told when all have ended
-            errors.append(raised)
-
-    others = [threading.Thread(target=do, args=(k,), name="at once", daemon=True) for k in range(1, threads)]
-    for each in others:
-        each.start()
-    do(0)
-    for each in others:
-        each.join()
-    if errors:
-        raise errors[0]
-
-
 def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     """What two works give that do not need each other; the second is done by a thread beside the first, on one core after it."""
     found: list[U] = []

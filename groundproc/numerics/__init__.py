@@ -1,4 +1,4 @@
-"""Arrays in, arrays out: no file, clock, log or flight, and no other room but the one that shares work out between cores.
+"""Arrays in, arrays out: no file, clock, log or flight, and no other room.
 
 rotations   quaternions, rotation vectors and matrices inside kernels
 splines     uniform cubic B-splines
@@ -8,6 +8,7 @@ planes      planes through the second moments of points
 memory      arrays whose memory is used again
 planerows   distances from such planes as rows of a least-squares problem, the planes solved for within
 planeproducts  the normal matrix of such rows times vectors
+parts       a kernel's work shared out between cores
 filters     low-pass, spectrum and peaks of evenly spaced series
 
 Kernels take few arguments: what belongs together is a named tuple of arrays, whose fields have shape, dtype and unit in its docstring. A

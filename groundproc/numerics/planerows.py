@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.machine.readahead import at_once
+from groundproc.numerics.parts import at_once
 from groundproc.numerics.planeproducts import ABREAST, RowArrays, products, products_abreast, row_times, solved_plane
 from groundproc.numerics.planes import Placed, VoxelPlanes, axes_along
 

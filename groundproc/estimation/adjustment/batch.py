@@ -16,6 +16,7 @@ from groundproc.estimation.observations.observation import Observation, State
 from groundproc.estimation.observations.rows import Factor, Unknowns, prior_factor, turned
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
+from groundproc.machine.readahead import both
 
 Array = npt.NDArray[np.float64]
 
@@ -106,8 +107,11 @@ class Batch:
         vanish.
         """
         unknowns = self.unknowns()
-        rows = self.lidar.rows(self.path, voxel_m, cut)
-        factors, figures = linearised((self.lidar, *self.observations), self.state(learn), unknowns)
+        state = self.state(learn)
+        rows, (factors, figures) = both(
+            lambda: self.lidar.rows(self.path, voxel_m, cut),
+            lambda: linearised((self.lidar, *self.observations), state, unknowns),
+        )
         linear = problem(rows, factors, unknowns, DEFLATION, self.path)
         x, steps = linear.solve(-linear.gradient, share=0.0 if cut else ROUGH)
         cost, used = rows.cost()

@@ -20,8 +20,8 @@ from flightlog import frames
 from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
-from groundproc.machine.readahead import at_once
 from groundproc.numerics import splines
+from groundproc.numerics.parts import at_once
 from groundproc.numerics.planeproducts import RowArrays, solved_plane
 
 Array = npt.NDArray[np.float64]

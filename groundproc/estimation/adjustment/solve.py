@@ -13,6 +13,7 @@ from groundproc.estimation.adjustment.coarse import Coarse, coarse_of
 from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.observations.rows import Factor, Unknowns, normal_equations
 from groundproc.estimation.odometry.spline import Path
+from groundproc.machine.readahead import both
 
 Array = npt.NDArray[np.float64]
 
@@ -144,17 +145,24 @@ def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation
     """Set a step up, linear about a path."""
     normal, gradient = normal_equations(factors)
     gradient[: rows.size] += rows.gradient() / deflation
-    band = _sparse_band(rows.band() * (SHARE / deflation), unknowns.size)
-    if rows.more:
-        band = band + _sparse_corner(rows.corner / deflation, rows.path_size, unknowns.size)
-    fine = splu(
-        (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
-    )
     by_row = normal.tocsr()
-    found = Problem(rows, deflation, by_row, gradient, fine, coarse_of(rows, deflation, by_row, path))
+    fine, coarse = both(lambda: _fine(rows, normal, deflation), lambda: coarse_of(rows, deflation, by_row, path))
+    found = Problem(rows, deflation, by_row, gradient, fine, coarse)
     wide = [sparse.diags(1.0 / each.sigma) @ each.matrix for each in factors if each.wide]
     if wide:
         found.wide = Wide(sparse.vstack(wide, format="csr"), found)
+    return found
+
+
+def _fine(rows: Rows, normal: sparse.csc_matrix, deflation: float) -> Factorisation:
+    """Factor everything else and a share of the lidar's information, its planes fixed."""
+    size = normal.shape[0]
+    band = _sparse_band(rows.band() * (SHARE / deflation), size)
+    if rows.more:
+        band = band + _sparse_corner(rows.corner / deflation, rows.path_size, size)
+    found: Factorisation = splu(
+        (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
+    )
     return found
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from groundproc.machine import readahead, system
-from groundproc.machine.readahead import ahead, beside
+from groundproc.machine.readahead import ahead, beside, both
 
 
 @pytest.fixture(autouse=True)
@@ -160,3 +160,7 @@ def test_an_interrupt_of_the_first_lets_one_work_end_and_begins_no_other() -> No
         beside([first, *(functools.partial(other, number) for number in range(many))])
     assert begun == ended, "the one that was being done is whole"
     assert len(begun) < many
+
+
+def test_two_works_give_what_they_give() -> None:
+    assert both(lambda: 1, lambda: "b") == (1, "b")

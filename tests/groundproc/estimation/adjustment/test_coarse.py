@@ -91,3 +91,20 @@ def test_the_solution_is_right_to_the_share_of_its_sigma_that_is_asked_for(posed
             off = found - np.linalg.solve(normal, right)
             assert off @ normal @ off < enough
             assert steps < 40
+
+
+def test_several_right_sides_are_solved_as_each_by_itself(posed: tuple[Problem, Array]) -> None:
+    """Some end after other numbers of steps, one is nothing, and together they are no whole number of blocks."""
+    problem, _ = posed
+    rng = np.random.default_rng(4)
+    rights = rng.normal(size=(len(problem.gradient), 7)) * np.geomspace(1e-3, 1e3, 7)
+    rights[:, 2] = 0.0
+    images = problem.apply_all(rights)
+    found = problem.solve_all(rights, 0.0, 1e-3)
+    steps = set()
+    for image, each, right in zip(images.T, found.T, rights.T, strict=True):
+        assert image == pytest.approx(problem.apply(right), rel=1e-9, abs=1e-9 * np.abs(image).max())
+        alone, count = problem.solve(right, 0.0, 1e-3)
+        steps.add(count)
+        assert each == pytest.approx(alone, rel=1e-9, abs=1e-9 * np.abs(alone).max())
+    assert len(steps) > 1
