@@ -72,11 +72,16 @@ def true_mount(nominal: Mount, options: Options, seed: int) -> Mount:
         antenna = _triple(np.add((0.0, 0.0, 0.0) if antenna is None else antenna, o.gps_error_m))
     turned = nominal.with_lidar(
         position_m=_triple(position),
-        yaw_deg=nominal.lidar.yaw_deg + yaw,
-        pitch_deg=nominal.lidar.pitch_deg + pitch,
-        roll_deg=nominal.lidar.roll_deg + roll,
+        yaw_deg=_within_turn(nominal.lidar.yaw_deg + yaw),
+        pitch_deg=_within_turn(nominal.lidar.pitch_deg + pitch),
+        roll_deg=_within_turn(nominal.lidar.roll_deg + roll),
     )
     return dataclasses.replace(turned, gps_position_m=antenna)
+
+
+def _within_turn(angle_deg: float) -> float:
+    """An angle brought to -180 to 180 deg; as it is where it lies there."""
+    return angle_deg if abs(angle_deg) <= 180.0 else (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def _triple(values: Array) -> tuple[float, float, float]:
@@ -178,7 +183,8 @@ class Simulation:
     def _boresight_deg(self) -> list[float]:
         """True minus nominal yaw, pitch and roll of the lidar."""
         true, nominal = self.mount.lidar, self.nominal_mount.lidar
-        return [getattr(true, name) - getattr(nominal, name) for name in ("yaw_deg", "pitch_deg", "roll_deg")]
+        names = ("yaw_deg", "pitch_deg", "roll_deg")
+        return [_within_turn(getattr(true, name) - getattr(nominal, name)) for name in names]
 
 
 def in_order(simulation: Simulation, workers: int) -> Iterator[Sweep]:

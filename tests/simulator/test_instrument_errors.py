@@ -309,3 +309,11 @@ def test_multipath_is_bound_to_the_place_and_leaves_heights_and_velocities_alone
     assert 1.0 < off[:, :2].std() < 4.0
     assert not off[:, 2].any()
     assert seen.velocity_m_s == pytest.approx(clean.velocity_m_s)
+
+
+def test_the_true_mount_of_a_lidar_upside_down_is_one_that_can_be_read_again(tmp_path):
+    """Half a turn and one degree more is half a turn less, the other way round."""
+    options = replace(Options(), mount=MountOptions(lidar_deg=(0.0, -20.0, 180.0), boresight_deg=(0.0, 0.0, 1.0)))
+    truth = Simulation(Job("field", 2.0, 1, tmp_path, options)).truth()
+    assert truth["mount_true"]["lidar"]["roll_deg"] == pytest.approx(-179.0)
+    assert truth["boresight_deg"] == pytest.approx([0.0, 0.0, 1.0])

@@ -250,9 +250,8 @@ class Run:
             **({} if corrections is None else {"lasers": corrections.report()}),
             "mount_change": {
                 "yaw_pitch_roll_deg": [
-                    mount.lidar.yaw_deg - nominal.lidar.yaw_deg,
-                    mount.lidar.pitch_deg - nominal.lidar.pitch_deg,
-                    mount.lidar.roll_deg - nominal.lidar.roll_deg,
+                    (getattr(mount.lidar, name) - getattr(nominal.lidar, name) + 180.0) % 360.0 - 180.0
+                    for name in ("yaw_deg", "pitch_deg", "roll_deg")
                 ],
                 "position_m": (mount.lidar_position_m() - nominal.lidar_position_m()).tolist(),
             },
