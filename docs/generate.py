@@ -3,7 +3,7 @@
 log-format.md is made from flightlog/records.py, dimensions.md from groundproc/cloud/dimensions.py, products.md from the registry of
 groundproc/products, uses/processing.md from that of groundproc/uses, survey.md from the dataclasses of groundproc/survey, the table in
 methods/observations.md from the registry of groundproc/estimation/observations, commands.md from the parsers of the commands.
-health.schema.json is made from onboard/health.py.
+health.schema.json is made from onboard/health.py, soak.md from the marks in tests/.
 Run it after a change of these: python docs/generate.py
 """
 
@@ -11,6 +11,7 @@ import dataclasses
 import importlib
 import json
 import re
+import sys
 import textwrap
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -28,6 +29,8 @@ from groundproc.survey.setting import command_of, default_of, value_text
 from onboard import healthschema
 
 DOCS: Final = Path(__file__).parent
+sys.path.insert(0, str(DOCS))
+from soak_page import soak_page  # noqa: E402 - beside this file, which is no package
 
 _RULE: Final = "=" * 80 + "\nMSG: "
 _STANDARD: Final = ("std_msgs/Header", "builtin_interfaces/Time")
@@ -358,6 +361,7 @@ _MADE: Final[dict[str, Callable[[], str]]] = {
     "log-format.md": page, "dimensions.md": dimensions_page, "products.md": products_page, "survey.md": survey_page,
     "uses/processing.md": uses_page,
     "methods/observations.md": observations_page, "commands.md": commands_page, "health.schema.json": health_schema,
+    "soak.md": soak_page,
 }  # fmt: skip
 PAGES: Final[dict[str, Callable[[], str]]] = {
     name: (lambda made=made: wrapped(made())) if name.endswith(".md") else made for name, made in _MADE.items()

@@ -221,6 +221,7 @@ def test_over_a_flat_field_the_place_is_no_worse_than_the_autopilots(hovered: li
     assert all(np.median(each.estimate.trajectory.sigma_position_m[:, :2]) > 0.5 for each in made)
 
 
+# by the two flights of the one above
 @pytest.mark.soak
 def test_over_a_flat_field_the_heading_is_no_worse_than_the_autopilots(hovered: list[tuple[Judged, Judged]]) -> None:
     raw, made = zip(*hovered, strict=True)

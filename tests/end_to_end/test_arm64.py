@@ -35,6 +35,7 @@ NEEDED = (
 )
 TOOLS = ("mmdebstrap", "qemu-aarch64-static", "chroot", "unshare", "dpkg-deb", "aarch64-linux-gnu-strip")
 missing = [name for name in TOOLS if shutil.which(name) is None]
+# a whole system of another machine, emulated; in the quick suite: the package of arm64 is of arm64 (test_package)
 pytestmark = [
     pytest.mark.soak,
     pytest.mark.root,

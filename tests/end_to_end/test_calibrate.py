@@ -91,6 +91,7 @@ def assert_sharper(before: dict[str, float], after: dict[str, float]) -> None:
     assert after["ate_m"] < before["ate_m"] + 0.002
 
 
+# the flight of the one above, adjusted once more
 @pytest.mark.soak
 def test_a_later_run_with_the_file_has_the_sharper_cloud(made: Path, flight: Any) -> None:
     without, before = made_with(flight.folder, Survey(method="adjusted"))
@@ -100,6 +101,7 @@ def test_a_later_run_with_the_file_has_the_sharper_cloud(made: Path, flight: Any
     assert_sharper(before, after)
 
 
+# the flight of the one above, adjusted once more
 @pytest.mark.soak
 def test_processing_finds_the_same_lasers_by_itself(made: Path, flight: Any) -> None:
     """The adjustment is the one of `swath calibrate`, whose lasers are judged above; here its estimate and its cloud are too."""
@@ -111,6 +113,7 @@ def test_processing_finds_the_same_lasers_by_itself(made: Path, flight: Any) -> 
     assert_sharper(before, itself)
 
 
+# the flight of the one above
 @pytest.mark.soak
 def test_the_compass_curve_holds_where_it_was_flown_and_says_where_it_was_not(made: Path, flight: Any) -> None:
     report = json.loads((made / "calibration.json").read_text())["compass"]
@@ -134,6 +137,7 @@ def test_the_compass_curve_holds_where_it_was_flown_and_says_where_it_was_not(ma
     assert "of all headings flown" in (made / "compass.yaml").read_text().splitlines()[1]
 
 
+# the flight of the one above
 @pytest.mark.soak
 def test_headings_of_the_autopilot_are_mended_by_the_file(made: Path, flight: Any) -> None:
     """Its compass is off by 8 deg and more, over part of the circle; what an AHRS sways by on its own, 1 deg, stays."""

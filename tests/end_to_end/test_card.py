@@ -116,6 +116,7 @@ def booted(folder: Path) -> Iterator[Guest]:
         guest.stop()
 
 
+# a card is made and boots as a whole system; in the quick suite: what is on it (above)
 @pytest.mark.soak
 @pytest.mark.root
 @pytest.mark.skipif(

@@ -84,6 +84,7 @@ def test_over_a_house_and_a_meadow_the_covariance_covers_the_errors(
     assert np.mean([each["within"] for each in found]) >= 0.9
 
 
+# twelve flights of 14 s over three scenes, and a whole adjustment each
 @pytest.mark.soak
 def test_over_many_seeds_and_scenes_the_covariance_is_that_of_the_errors(simulated: Callable[..., Any]) -> None:
     from simulator.plans import plan

@@ -106,6 +106,7 @@ def test_spoilt_files_of_every_kind_end_in_a_sentence(tmp_path: Path) -> None:
     assert found.codes[0] > 0
 
 
+# ten minutes by the clock, others each time; in the quick suite two files for each door
 @pytest.mark.soak
 def test_ten_minutes_of_spoilt_files(tmp_path: Path) -> None:
     end, seed = time.monotonic() + SOAK_S, time.time_ns() % 1_000_000

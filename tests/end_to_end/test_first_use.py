@@ -19,6 +19,7 @@ def flight(live_flight: Any) -> Any:
     return live_flight
 
 
+# a warm-up, and a whole flight by the default method
 @pytest.mark.soak
 def test_a_flight_after_warming_up_compiles_nothing(
     tmp_path: Path, flight: Any, capsys: pytest.CaptureFixture[str]
@@ -31,6 +32,7 @@ def test_a_flight_after_warming_up_compiles_nothing(
     assert compiled == []
 
 
+# everything is compiled anew
 @pytest.mark.soak
 def test_a_new_process_finds_all_of_it_in_the_users_cache(tmp_path: Path, flight: Any) -> None:
     """From an empty cache: the files of compiled code after a warm-up, and after a flight that was processed then, are the same."""

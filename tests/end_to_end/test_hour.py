@@ -63,6 +63,7 @@ def processed(flight: Path, times: int, place: Path) -> Processed:
     return Processed(quality, *figures)
 
 
+# an hour of flight
 @pytest.mark.soak
 def test_an_hour_goes_through_in_under_2_gb(place: Path) -> None:
     swath = Path(sys.executable).with_name("swath")

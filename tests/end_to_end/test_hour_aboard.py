@@ -61,6 +61,7 @@ def logged(logs: Path) -> tuple[int, int]:
     return taken, lost
 
 
+# six minutes by the clock
 @pytest.mark.soak
 def test_an_hour_of_packets_in_six_minutes_leaves_memory_where_it_was(place: Path) -> None:
     port, mavlink_port, logs = free_port(), free_port(), place / "logs"

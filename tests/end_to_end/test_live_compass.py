@@ -59,7 +59,7 @@ class Compared:
         self.way_m = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
 
 
-# in the quick suite: that a turned map is no lost way (odometry), and that the live view is the causal method (test_live)
+# in the quick suite: that a turned map is no lost way (odometry), and that the live view is right to centimetres (test_live)
 @pytest.mark.soak
 def test_a_compass_that_is_off_is_no_lost_way(tmp_path: Path, street: Any, capsys: pytest.CaptureFixture[str]) -> None:
     out, processed = tmp_path / "live", tmp_path / "processed"

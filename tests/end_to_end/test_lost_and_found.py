@@ -20,6 +20,7 @@ from groundproc.survey import Survey
 GAP_FROM_S = 20.0
 
 
+# two flights of 44 and 50 s; in the quick suite: how a map is found again (odometry/test_rejoining, test_relocation)
 @pytest.mark.soak
 @pytest.mark.parametrize(("seed", "gap_s", "seconds"), [(5, 6.0, 44.0), (6, 12.0, 50.0)])
 def test_after_seconds_without_lidar_and_satellites_the_map_is_found_again(

@@ -90,6 +90,7 @@ def test_it_is_small_and_of_the_architecture_that_it_states(debs: Path, architec
     assert int.from_bytes(compiled.read_bytes()[18:20], "little") == machine
 
 
+# the package is built once more
 @pytest.mark.soak
 def test_the_same_sources_make_the_same_bytes(debs: Path, tmp_path: Path) -> None:
     make(tmp_path, "amd64")
@@ -252,6 +253,7 @@ def test_an_upgrade_keeps_configuration_and_recordings_and_records_on(guest: Gue
     assert before[0] in manifest  # closed, not cut off
 
 
+# one more installation in a booted system
 @pytest.mark.soak
 @rooted
 def test_a_service_that_its_owner_has_disabled_stays_so(guest: Guest) -> None:

@@ -208,6 +208,7 @@ def test_a_card_with_a_volatile_cache_loses_less_than_a_second_too(tmp_path: Pat
     assert max(losses) <= ALLOWED_LOSS_S
 
 
+# forty cuts; in the quick suite a few
 @pytest.mark.soak
 def test_twenty_power_cuts_at_full_rate_and_twenty_with_the_lidar_silent(tmp_path: Path) -> None:
     losses = []
@@ -219,6 +220,7 @@ def test_twenty_power_cuts_at_full_rate_and_twenty_with_the_lidar_silent(tmp_pat
     assert max(losses) <= ALLOWED_LOSS_S
 
 
+# thirty cuts; in the quick suite two
 @pytest.mark.soak
 def test_thirty_power_cuts_of_a_volatile_cache_around_rotations(tmp_path: Path) -> None:
     """A segment lives for a second and takes most of one to be closed: each cut is near a rotation."""
@@ -274,6 +276,7 @@ def write_leftover(path: Path, size_mb: int) -> int:
     return count
 
 
+# a gigabyte to be mended; in the quick suite 60 MB
 @pytest.mark.parametrize("size_mb", [60, pytest.param(1024, marks=pytest.mark.soak)])
 def test_a_large_leftover_does_not_delay_the_first_packet(tmp_path: Path, size_mb: int) -> None:
     logs = tmp_path / "logs"

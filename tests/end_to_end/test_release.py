@@ -63,6 +63,7 @@ def test_the_bill_of_materials_is_one_by_its_standard_and_whole(release: ModuleT
     assert json.loads(text)["metadata"]["component"]["version"] == PROJECT["version"]
 
 
+# everything that is published is built
 @pytest.mark.soak
 def test_a_release_is_whole_and_its_checksums_hold(tmp_path: Path) -> None:
     done = subprocess.run(

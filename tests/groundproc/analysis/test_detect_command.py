@@ -104,6 +104,8 @@ def test_a_wood_without_cars_has_hardly_any(tmp_path: Path) -> None:
     assert len(objects(tmp_path / "o.geojson")) <= 1
 
 
+# a recorded wood with forty vehicles put in; in the quick suite: cars under made-up trees, and none in a wood without (above)
+@pytest.mark.soak
 @pytest.mark.skipif(not RECORDINGS, reason="SWATH_RECORDINGS is not set")
 def test_cars_put_into_a_real_wood_are_found_at_five_false_alarms_a_hectare(tmp_path: Path) -> None:
     source = Path(RECORDINGS, "clouds", "lasR_bcts_1.laz")

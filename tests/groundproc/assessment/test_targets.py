@@ -79,6 +79,7 @@ def test_a_ball_is_found_by_its_shape(radius_m: float) -> None:
         assert found.sigma_m[2] < (0.025 if size is None else 0.012)
 
 
+# twenty-four targets of each kind; in the quick suite four
 @pytest.mark.soak
 @pytest.mark.parametrize("kind", list(TEXTURES))
 def test_no_centre_is_false_over_densities_contrasts_noise_and_scales(
@@ -129,6 +130,7 @@ def _painted(name: str) -> scenes.Texture:
     return lambda u, v: np.where(drawn(u, v), 0.7, 0.1)
 
 
+# each marking at one density in the quick suite, at two in the soak
 @pytest.mark.parametrize(
     "name", ["asphalt", "line", "edge", "corner", "junction", "crossing", "zebra", "dash", "square"]
 )

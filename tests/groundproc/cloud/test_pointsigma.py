@@ -256,6 +256,7 @@ def test_errors_of_one_flight_are_within_two_sigma(judged_flight: "Simulated") -
     assert draws(flown(judged_flight, "sigma"))[1].min() > 0.95
 
 
+# twenty flights; in the quick suite one
 @pytest.mark.soak
 def test_of_twenty_flights_two_thirds_are_within_one_sigma_and_nineteen_within_two(
     simulated: Callable[..., "Simulated"],

@@ -427,6 +427,7 @@ def test_wild_outside_positions_do_no_harm(ordinary: list[Flown]) -> None:
     assert np.sqrt(np.mean(np.square(found.position[inside]))) < 0.3
 
 
+# 60 s of its own
 @pytest.mark.soak
 def test_heights_between_poses_hold_though_accelerometers_shake_and_are_two_per_cent_off(simulated: Any) -> None:
     """Poses of 5 mm every 2.4 s: they were 19 mm off between, and 1.9 sigma, when vibration was taken for white noise."""

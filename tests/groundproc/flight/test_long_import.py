@@ -25,6 +25,7 @@ def measured(*words: object) -> tuple[str, float]:
     return run.stdout, int(run.stderr.splitlines()[-1]) / 1024
 
 
+# an hour of packets
 @pytest.mark.soak
 def test_an_hour_is_imported_and_summed_up_in_little_memory(
     tmp_path: Path,

@@ -108,6 +108,8 @@ def test_every_point_goes_out_as_it_came_in_and_without_views_it_is_black(place:
     assert set(np.asarray(few.views)) == {0, 1}
 
 
+# a second block drawn and laid; in the quick suite: a warm car that passes is voted out (test_hamlet)
+@pytest.mark.soak
 def test_what_passes_by_is_voted_out(place: Path, coloured: laspy.LasData) -> None:
     """A bright car in one picture only, where five or more others see the ground."""
     folder = place / "car"

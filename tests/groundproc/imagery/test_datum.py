@@ -84,7 +84,14 @@ def test_an_estimate_keeps_what_all_poses_share(folder: Path) -> None:
     np.testing.assert_array_equal(np.diag(datum), [STATED_M**2] * 3 + [1e-8] * 3)
 
 
-@pytest.mark.parametrize("cloud", [False, True], ids=["without lidar", "with the cloud of that trajectory"])
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        pytest.param(False, id="without lidar"),
+        # with the cloud once more; in the quick suite the cloud moves with all of it (below)
+        pytest.param(True, marks=pytest.mark.soak, id="with the cloud of that trajectory"),
+    ],
+)
 def test_sigmas_of_points_hold_the_datum_of_the_trajectory(folder: Path, cloud: bool) -> None:
     told = adjusted(folder, *(("--cloud", str(folder / "cloud.laz")) if cloud else ()))
     assert 0.9 < told["sigma0"] < 1.1

@@ -276,6 +276,8 @@ def test_a_wide_image_is_what_its_own_camera_would_have_seen(place: Path, tmp_pa
         assert np.sqrt((left**2).mean()) < 0.02
 
 
+# a second block drawn and laid; in the quick suite: temperatures of points (test_hamlet), colours of mosaics (above)
+@pytest.mark.soak
 def test_a_mosaic_of_temperatures_is_right_to_a_kelvin(place: Path, tmp_path: Path) -> None:
     """The file says how its numbers become degrees, and no picture is brought to the exposure of others: numbers are temperatures."""
     response = {"scale": 0.04, "offset": -100.0}

@@ -21,7 +21,10 @@ BELIEVED = {
 }
 
 
-@pytest.mark.parametrize("case", BELIEVED)
+# an adjustment each: one that is wrong and one that is right in the quick suite
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.soak if case == "fish-eye as Brown" else ()) for case in BELIEVED]
+)
 def test_a_wrong_lens_model_is_named_with_its_remedy(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,6 +14,7 @@ from simulator import cameras, plans
 from simulator.render import render
 from simulator.simulation import Job
 
+# 44 s of photographs are drawn and matched; in the quick suite: photographs of a plane, as steps of a flight (steps/test_images)
 pytestmark = pytest.mark.soak
 
 GSD_M = 32.0 / 312.5

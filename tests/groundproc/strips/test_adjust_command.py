@@ -243,6 +243,8 @@ def test_an_sbet_is_a_trajectory_too(tmp_path: Path, wrong_scan: aerial.Scan, ad
     np.testing.assert_allclose(one.xyz, other.xyz, atol=0.0021)
 
 
+# a scan and an adjustment of its own; in the quick suite: how .pos is read, and adjustments by trajectories with attitude
+@pytest.mark.soak
 def test_positions_alone_do_for_the_splines(tmp_path: Path, adjust: Callable[..., Any]) -> None:
     """NMEA or .pos has no attitude: the mount is held, errors of position and attitude are still found."""
     scan = aerial.scanned(aerial.flown(), aerial.Errors(0.12, 0.02))

@@ -50,6 +50,7 @@ def test_the_aerial_block_has_the_sigma_and_the_poses_of_the_report(
     np.testing.assert_allclose(np.linalg.norm(sigma["65265"]), 0.64, rtol=0.01)
 
 
+# a second adjustment of the block; in the quick suite the one with control (above)
 @pytest.mark.soak
 def test_the_free_network_has_the_sigma_the_camera_and_the_deviations_of_the_report(
     recordings: Path, tmp_path: Path
