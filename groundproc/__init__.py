@@ -1,5 +1,6 @@
 """The ground side: flight log in, clouds, trajectories and figures about them out."""
 
-from groundproc.machine import kernelcache
+from groundproc.machine import kernelcache, system
 
+system.choose_threads_of_blas()
 kernelcache.choose()

@@ -1,5 +1,6 @@
 """What systems do differently, and what is installed beside us."""
 
+import os
 import subprocess
 import sys
 
@@ -26,3 +27,14 @@ def test_the_steps_of_a_flight_load_no_data_frames_no_cloud_services_and_no_imag
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
+def test_linear_algebra_takes_one_thread_unless_it_is_told_otherwise(given: str | None, expected: str) -> None:
+    """Said before numpy is loaded, by the package itself."""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    if given is not None:
+        environment["OPENBLAS_NUM_THREADS"] = given
+    program = "import sys, groundproc, os; assert 'numpy' not in sys.modules; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    told = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert told.stdout.split() == [expected]
