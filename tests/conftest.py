@@ -221,12 +221,15 @@ def live_flight(simulated: Callable[..., Simulated]) -> Simulated:
 
 @pytest.fixture(scope="session")
 def gps_flight(simulated: Callable[..., Simulated]) -> Simulated:
-    """16 s over level ground and along a wall, with all errors; the lidar's clock is steered by its own GPS."""
+    """16 s over level ground and along a wall, with all errors; the lidar's clock is steered by its own GPS.
+
+    One revolution in ten: what is asked of its cloud, any of them tells.
+    """
     from simulator.config import Options
 
     options = Options()
     options = replace(options, clocks=replace(options.clocks, lidar_gps=True))
-    return simulated("gps_flight", "field", 16.0, options, every=4)
+    return simulated("gps_flight", "field", 16.0, options, every=10)
 
 
 @pytest.fixture(scope="session")

@@ -76,10 +76,19 @@ def covers(found: list[dict[str, float]], *, loose: bool) -> None:
         assert loose or total > chi2.ppf(0.001, freedom), (name, [each[name] for each in found])
 
 
+@pytest.mark.parametrize(
+    "flights",
+    [
+        ["house_flight"],
+        # a flight and a whole adjustment more
+        pytest.param(["house_flight", "meadow_flight"], marks=pytest.mark.soak),
+    ],
+    ids=["house", "house and meadow"],
+)
 def test_over_a_house_and_a_meadow_the_covariance_covers_the_errors(
-    house_flight: Any, meadow_flight: Any, adjustment: Callable[[Any], Estimate]
+    flights: list[str], request: pytest.FixtureRequest, adjustment: Callable[[Any], Estimate]
 ) -> None:
-    found = [flown(each.folder, adjustment(each)) for each in (house_flight, meadow_flight)]
+    found = [flown(each.folder, adjustment(each)) for each in map(request.getfixturevalue, flights)]
     covers(found, loose=True)
     assert np.mean([each["within"] for each in found]) >= 0.9
 

@@ -168,7 +168,8 @@ def test_with_true_poses_the_cloud_lies_on_the_true_surfaces(gps_flight: Any, tm
     inside = (np.abs(points[:, 0]) < 29.5) & (points[:, 2] > 0.5) & (points[:, 2] < 7.5)
     on_wall = in_sight & inside & (np.abs(points[:, 1] - 20.0) < 0.3) & (ray[:, 1] / reach > np.cos(np.pi / 4))
     wall_m = reach[on_wall] * (1.0 - (20.0 - lidar[on_wall, 1]) / ray[on_wall, 1])
-    for missed_m, least in ((ground_m, 100_000), (wall_m, 1_000)):
+    # so many tell the ground's rms to 0.4 % and its mean to 0.08 mm
+    for missed_m, least in ((ground_m, 40_000), (wall_m, 1_000)):
         assert len(missed_m) > least
         assert np.sqrt(np.mean(missed_m**2)) <= 1.05 * RANGE_NOISE_M
         # no surface is displaced: the mean of so many is their common error, the local frame's scale at sea level included (0.2 mm)
@@ -477,7 +478,7 @@ def test_a_log_that_a_power_cut_ended_is_processed_as_far_as_it_goes(
 ) -> None:
     content = gps_flight.log.read_bytes()
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(content[: len(content) * 4 // 5])
+    cut.write_bytes(content[: len(content) * 9 // 10])
     made = process(tmp_path / "out", cut)
     assert made.quality["inputs"][0]["truncated"] is True
     assert made.quality["verdict"] == "doubtful"
