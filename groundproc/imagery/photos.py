@@ -11,18 +11,19 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
 from flightlog.clock import is_plausible
 from flightlog.errors import CaptureError
+from groundproc.imagery.pictures import reason_of, size_of
 from groundproc.imagery.poses import NO_TIME
 
 Array = npt.NDArray[np.float64]
 
 ENDINGS: Final = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
+_TIFF: Final = (".tif", ".tiff")
 _MOST_PIXELS: Final = 500_000_000
 _XMP_BYTES: Final = 8 << 20
 _EXIF_IFD: Final = 0x8769
@@ -139,19 +140,13 @@ def look(files: Sequence[Path]) -> Iterator[Picture | tuple[str, str]]:
         try:
             yield _look(path, name)
         except (OSError, UnidentifiedImageError, ValueError, SyntaxError, EOFError, ZeroDivisionError) as error:
-            yield name, f"is no image that can be read ({_reason(error)})"
-
-
-def _reason(error: BaseException) -> str:
-    text = str(getattr(error, "strerror", None) or error).split("\n")[0][:80]
-    return "cannot be identified" if isinstance(error, UnidentifiedImageError) else text or type(error).__name__
+            yield name, f"is no image that can be read ({reason_of(error)})"
 
 
 def _look(path: Path, name: str) -> Picture:
-    with warnings.catch_warnings(), Image.open(path) as image:
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is wrong in EXIF is left out; the picture may be good
-        width, height = image.size
-        exif = image.getexif()
+        width, height, exif = _head(path)
         # some writers put into the first directory what belongs into the second
         detail, gps = dict(exif) | dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
         head = {"make": exif.get(0x010F, ""), "model": exif.get(0x0110, "")}
@@ -169,6 +164,28 @@ def _look(path: Path, name: str) -> Picture:
         name, path, width, height, _exif_ns(detail), _gps_ns(gps), _fix(gps, xmp),
         _number(xmp.get("RelativeAltitude")), _look_of(xmp), tags,
     )  # fmt: skip
+
+
+def _head(path: Path) -> tuple[int, int, Image.Exif]:
+    """Width, height and EXIF; of a TIFF with planes that Pillow does not know (five bands, floating point) by GDAL."""
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            # read while the file is open
+            exif.get_ifd(_EXIF_IFD), exif.get_ifd(_GPS_IFD)
+            return (*image.size, exif)
+    except UnidentifiedImageError:
+        if path.suffix.lower() not in _TIFF:
+            raise
+    try:
+        size = size_of(path)
+    except CaptureError:
+        raise UnidentifiedImageError from None
+    exif = Image.Exif()
+    with path.open("rb") as file:
+        exif.load_from_fp(file)
+        exif.get_ifd(_EXIF_IFD), exif.get_ifd(_GPS_IFD)
+    return size.width_px, size.height_px, exif
 
 
 def read_xmp(data: bytes) -> dict[str, str]:
@@ -296,36 +313,3 @@ def _look_of(xmp: dict[str, str]) -> Array | None:
             wing = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
             return np.asarray(_NED_OF_ENU @ turn @ nose @ wing @ mat)
     return None
-
-
-def gray(path: Path, longest_px: int) -> tuple[npt.NDArray[np.uint8], float]:
-    """An image as one grey plane with sides of so many pixels at most, and the size of its pixels in those of the file.
-
-    Pixel (0, 0) of it is the mean of the file's first ones: x of the file is (x + 0.5) size - 0.5.
-
-    Raises
-    ------
-    CaptureError
-        It cannot be read as a whole.
-    """
-    try:
-        with Image.open(path) as image:
-            width = image.width
-            if image.format == "JPEG":
-                image.draft("L", (longest_px, longest_px))
-            plane = np.asarray(image.convert("L") if image.mode not in ("I;16", "I", "F") else image)
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, MemoryError) as error:
-        raise CaptureError(f"{path}: is no image that can be read ({_reason(error)})") from None
-    if plane.dtype != np.uint8:
-        low, high = np.percentile(plane, (0.5, 99.5))
-        plane = np.clip((plane - low) / max(float(high - low), 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8)
-    size = width / plane.shape[1]
-    if plane.shape[1] != width:  # the decoder scales by powers of two, and pads what is left over
-        size = 2.0 ** round(math.log2(size))
-    most = max(plane.shape)
-    if most > 1.3 * longest_px:
-        factor = longest_px / most
-        wide, high = round(plane.shape[1] * factor), round(plane.shape[0] * factor)
-        size *= plane.shape[1] / wide
-        plane = np.asarray(cv2.resize(plane, (wide, high), interpolation=cv2.INTER_AREA), np.uint8)
-    return np.ascontiguousarray(plane), size

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flightlog.errors import CaptureError
 from groundproc.imagery.camera import Camera
-from groundproc.imagery.photos import gray
+from groundproc.imagery.pictures import gray
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -2,11 +2,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from PIL import Image
 
 from flightlog.errors import CaptureError
 from groundproc.imagery.exifrig import rig_of
-from groundproc.imagery.photos import Picture, files_of, gray, look
+from groundproc.imagery.photos import Picture, files_of, look
+from groundproc.imagery.pictures import gray
 from groundproc.imagery.poses import NO_TIME
 
 
@@ -73,6 +75,28 @@ def test_pixels_of_a_reduced_picture_are_means_of_the_file_s(tmp_path: Path) -> 
     assert size == 2.0
     # the edge between file pixels 299 and 300 is that between 149 and 150
     assert found[150, 149] < 100 < found[150, 150]
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+@pytest.mark.parametrize(
+    ("planes", "dtype", "top"), [(5, "uint16", 4095), (3, "uint16", 4095), (2, "uint16", 900), (3, "float32", 1)]
+)
+def test_several_planes_of_more_than_eight_bits_are_one_picture(
+    tmp_path: Path, planes: int, dtype: str, top: int
+) -> None:
+    """Bands of a multispectral camera, or 12 bits in 16: with all the grey levels that they have."""
+    grey = np.add.outer(np.arange(40), np.arange(60)) / 98.0
+    path = tmp_path / "a.tif"
+    with rasterio.open(path, "w", driver="GTiff", width=60, height=40, count=planes, dtype=dtype) as file:
+        file.write(np.stack([grey * top] * planes).astype(dtype))
+        file.update_tags(TIFFTAG_DATETIME="2023:11:14 22:13:20")
+    one = looked(path)
+    assert (one.width_px, one.height_px, one.exif_ns) == (60, 40, 1_700_000_000_000_000_000)
+    shown, size = gray(path, 100)
+    assert size == 1.0
+    inner = (grey > 0.05) & (grey < 0.95)
+    assert np.corrcoef(shown[inner], grey[inner])[0, 1] > 0.9999
+    assert len(np.unique(shown)) > 90
 
 
 def test_a_place_without_images_is_told(tmp_path: Path) -> None:
