@@ -66,15 +66,24 @@ def accepted(block: Block, known: tuple[RigCamera, ...]) -> tuple[tuple[tuple[st
     best = error(left)
     while left:
         without = {name: error([other for other in left if other != name]) for name in left}
-        told |= {
-            name: {"group": name, "accepted": best < BETTER * without[name], "held_out_px": best, "without_px": without[name]}
-            for name in left
-        }  # fmt: skip
+        for name in left:
+            better = best < BETTER * without[name]
+            told[name] = {
+                "group": name,
+                "accepted": better,
+                "held_out_px": _finite(best),
+                "without_px": _finite(without[name]),
+            }
         least = min(left, key=without.__getitem__)
         if told[least]["accepted"]:
             break
         left, best = [name for name in left if name != least], without[least]
     return _unknowns_of(left, wanted), [told[name] for name, _ in GROUPS if name in told]
+
+
+def _finite(value_px: float) -> float | None:
+    """None where no held-out view has points to judge by."""
+    return value_px if np.isfinite(value_px) else None
 
 
 def _unknowns_of(groups: Sequence[str], wanted: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:

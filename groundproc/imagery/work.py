@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import CaptureError, UsageError
-from groundproc.imagery import assembly, flown, gate, hybrid, lasting, located, results
+from groundproc.imagery import assembly, clockoffset, flown, gate, hybrid, lasting, located, results
 from groundproc.imagery.assembly import Assembled, Known
 from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.screen import Adjusted, adjust
 from groundproc.imagery.lensdoubt import lens_doubts
 from groundproc.imagery.measurements import Measurements, Tracks, gather, rows_of
 from groundproc.imagery.poses import NO_TIME
-from groundproc.imagery.rig import RigCamera
+from groundproc.imagery.rig import Rig, RigCamera
 from groundproc.imagery.session import Progress, Session, Task, begin, known_of, names_listed
 from groundproc.imagery.surface import Surface, held_to, read_surface
 from groundproc.imagery.thinning import completed, renewed, thinned
@@ -47,10 +47,10 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     session = begin(task, progress)
     known = known_of(session)
     surface = None if task.cloud is None else read_surface(task.cloud, session.site, lambda n: progress("cloud", n))
-    tracks = None
-    if task.image_points is None:
-        known, tracks = _tied(session, known, surface, progress)
-    measured = gather(session.names, session.marks, tracks)
+    seen: dict[str, Features | str] = {}
+    known, measured = _measured(task, session, known, surface, seen, progress)
+    if _set_clocks(session, measured):
+        known, measured = _measured(task, session, known_of(session), surface, seen, progress)
     made = assembly.assemble(
         session.rig, session.names, session.camera, known, measured, session.site, session.control, ()
     )
@@ -61,9 +61,43 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     return _finish(task, session, adjusted, measured, told)
 
 
-def _tied(session: Session, known: Known, surface: Surface | None, progress: Progress) -> tuple[Known, Tracks]:
+def _measured(
+    task: Task,
+    session: Session,
+    known: Known,
+    surface: Surface | None,
+    seen: dict[str, Features | str],
+    progress: Progress,
+) -> tuple[Known, Measurements]:
+    """Image points: those given, or what is matched as well."""
+    tracks = None
+    if task.image_points is None:
+        known, tracks = _tied(session, known, surface, seen, progress)
+    return known, gather(session.names, session.marks, tracks)
+
+
+def _set_clocks(session: Session, measured: Measurements) -> bool:
+    """Clocks that are off by seconds are set by the rays of common points, and that is said; whether any was."""
+    if session.trajectory is None:
+        return False
+    cameras = list(session.rig.cameras)
+    for number, one in enumerate(cameras):
+        off_s = clockoffset.found(session.trajectory, one, session.camera == number, session.time_ns, measured)
+        if off_s:
+            cameras[number] = replace(one, timeshift_s=one.timeshift_s + off_s)
+            session.warnings.append(
+                f"{one.name}: its clock is off by {off_s:+.2f} s against the trajectory, as common points show; begun from there"
+            )
+    changed = cameras != list(session.rig.cameras)
+    session.rig = Rig(tuple(cameras))
+    return changed
+
+
+def _tied(
+    session: Session, known: Known, surface: Surface | None, seen: dict[str, Features | str], progress: Progress
+) -> tuple[Known, Tracks]:
     """Match all images; those that cannot be read are left out."""
-    features = _features(session, progress)
+    features = _features(session, seen, progress)
     lost = np.array([one is None for one in features])
     if lost.any():
         why = {name: session.left_out[name] for name, gone in zip(session.names, lost, strict=True) if gone}
@@ -83,10 +117,12 @@ def _tied(session: Session, known: Known, surface: Surface | None, progress: Pro
     return known, tracks_of(features, matches)
 
 
-def _features(session: Session, progress: Progress) -> list[Features | None]:
-    """Features of each image, None where one cannot be read."""
+def _features(session: Session, seen: dict[str, Features | str], progress: Progress) -> list[Features | None]:
+    """Features of each image, None where one cannot be read; what was seen already is there, and what is new is added."""
 
     def work(number: int) -> Features | str:
+        if session.names[number] in seen:
+            return seen[session.names[number]]
         picture = session.pictures[number]
         try:
             return features_of(picture.path, session.rig.cameras[session.camera[number]].camera)
@@ -97,6 +133,7 @@ def _features(session: Session, progress: Progress) -> list[Features | None]:
     with ThreadPoolExecutor(2) as pool:
         for number, one in enumerate(pool.map(work, range(len(session.pictures)))):
             progress("features", 1)
+            seen[session.names[number]] = one
             if isinstance(one, str):
                 session.left_out[session.names[number]] = one
             found.append(None if isinstance(one, str) else one)
