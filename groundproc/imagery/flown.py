@@ -32,6 +32,11 @@ LATE_SIGMA_S: Final = 0.01
 """By how much an autopilot's attitudes may be later than places: what filters of gyros delay them."""
 OF_AUTOPILOT: Final = ("filtered", "ins")
 """Methods whose attitudes are the autopilot's; one clock is behind all that others find."""
+_WITHIN_SECOND_NS: Final = tuple(range(-400_000_000, 400_000_001, 200_000_000))
+"""Where a stamp of whole seconds may be, half a second before and after the mean."""
+_CUT_ALIKE: Final = 6.0
+"""Exposures at even intervals are cut off alike for the images of a strip, which then count as one."""
+_LEAST_STAMPS: Final = 3
 LEAST_SHARE: Final = 1e-3
 """Of a variance: less is not believed to be left beside the datum, which is as well known as draws tell it."""
 PLAIN_PLACE_M: Final = (0.1, 0.1, 0.15)
@@ -134,6 +139,33 @@ def _covariance(trajectory: Trajectory, time_ns: Ints, mat: Array, place: Array,
     return turned, stated
 
 
+def whole_seconds(time_ns: Ints) -> bool:
+    """Whether stamps are those of a clock that shows whole seconds, as EXIF without sub-seconds."""
+    known = time_ns[time_ns != NO_TIME]
+    return len(known) >= _LEAST_STAMPS and not (known % 10**9).any()
+
+
+def _stamped(trajectory: Trajectory, time_ns: Ints, sampled: Sampled, whole: bool) -> Array:
+    """Covariance of poses, shape (n, 6, 6), with what they change within half a second before and after if stamps are whole seconds.
+
+    Place and turn by themselves: a turn within a second is no straight line, and would seem to tell the time.
+    """
+    if not whole:
+        return sampled.covariance
+    covariance = sampled.covariance.copy()
+    plain = np.array([1.0, 0.0, 0.0, 0.0])
+    inverse = frames.quat_inverse(frames.quat_from_mat(sampled.mat_local_ins))
+    for later_ns in _WITHIN_SECOND_NS:
+        poses, covered = trajectory.where_covered(time_ns + later_ns)
+        both = (covered & sampled.covered)[:, None]
+        moved = np.where(both, poses.position_m - sampled.place_m, 0.0)
+        quat = np.where(both, poses.quat_local_ins_wxyz, plain)
+        turned = np.where(both, frames.quat_log(frames.quat_multiply(quat, inverse)), 0.0)
+        for part, change, times in ((slice(0, 3), moved, _CUT_ALIKE), (slice(3, 6), turned, 1.0)):
+            covariance[:, part, part] += times * change[:, :, None] * change[:, None, :] / len(_WITHIN_SECOND_NS)
+    return covariance
+
+
 def whole_offset_ns(trajectory: Trajectory, time_ns: Ints) -> int:
     """Quarters of an hour [ns] by which stamps are local time: those that put most of them into the flight, the fewest that do."""
     known = time_ns[time_ns != NO_TIME]
@@ -181,8 +213,9 @@ def stations_of(trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints) -
         station_time, sampled.place_m, sampled.mat_local_ins, sampled.velocity_m_s, sampled.rate_rad_s, lead
     )
     rows = np.flatnonzero(sampled.covered)
+    covariance = _stamped(trajectory, station_time + _shift_ns(rig, lead), sampled, whole_seconds(time_ns))
     priors = PosePriors(
-        rows, sampled.place_m[rows], sampled.mat_local_ins[rows], sampled.covariance[rows], np.zeros((len(rows), 3)),
+        rows, sampled.place_m[rows], sampled.mat_local_ins[rows], covariance[rows], np.zeros((len(rows), 3)),
         sampled.velocity_m_s[rows], np.einsum("kij,kj->ki", sampled.mat_local_ins[rows], sampled.rate_rad_s[rows]),
         np.ones(len(rows)), common=Common(covariance=trajectory.datum),
     )  # fmt: skip
@@ -226,7 +259,7 @@ def resampled(trajectory: Trajectory, block: Block) -> Block:
             priors,
             place_m=sampled.place_m,
             mat_local_ins=later.mat_local_ins,
-            covariance=sampled.covariance,
+            covariance=_stamped(trajectory, time_ns, sampled, whole_seconds(stations.time_ns)),
             velocity_m_s=sampled.velocity_m_s,
             turning_rad_s=np.einsum("kij,kj->ki", later.mat_local_ins, later.rate_rad_s),
         ),

@@ -232,6 +232,11 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
             hours = -offset_ns / 3.6e12
             session.warnings.append(f"the cameras' clocks show local time, {hours:+g} h from UTC: taken off")
             session.time_ns = np.where(session.time_ns == NO_TIME, NO_TIME, session.time_ns + offset_ns)
+    if flown.whole_seconds(session.time_ns):
+        session.warnings.append(
+            "the times of the images are whole seconds: their places along the flight count for half a second's way; give --times, or a "
+            "log that notes exposures, to know better"
+        )
     session.keep(session.time_ns != NO_TIME, "has no time (EXIF, --times), and so no place on the trajectory")
     session.rig = with_sigmas(session.rig)
 

@@ -15,7 +15,8 @@ from imageblock import Flown, disturbed, fly, relief, site, true_camera, write_b
 
 from flightlog import frames
 from groundproc.cli import main
-from groundproc.imagery.rig import RigCamera, read_rig
+from groundproc.imagery.flown import stations_of
+from groundproc.imagery.rig import Rig, RigCamera, read_rig
 from groundproc.imagery.rotations import STRAIGHT_DOWN
 
 Array = npt.NDArray[np.float64]
@@ -140,3 +141,17 @@ def test_poses_of_a_block_begin_another_one_and_are_no_observations(block: tuple
     assert told["unknowns"] == 6 * counts["images"] + 3 * counts["points"] + free - 7
     assert told["observations"] == counts["image_rows"] + counts["camera_rows"]
     assert 0.9 < told["sigma0"] < 1.1
+
+
+def test_stamps_of_whole_seconds_count_for_the_way_of_a_second(block: tuple[Path, Flown]) -> None:
+    """Variance along the way of what is cut off, 6 m/s, six images cut alike, and little across it."""
+    _, flown = block
+    rig, none = Rig((flown.camera,)), np.zeros(len(flown.stamp_ns), np.int64)
+    known = disturbed(flown, 8, np.array([0.02, 0.02, 0.03]), np.array([0.05, 0.05, 0.1]))
+    whole, fine = (
+        stations_of(known, rig, none, stamps)[0].priors.covariance
+        for stamps in (flown.stamp_ns // 10**9 * 10**9, flown.stamp_ns // 10**9 * 10**9 + 1)
+    )
+    grown = (whole - fine)[len(whole) // 2]
+    assert np.sqrt(grown[0, 0]) == pytest.approx(6.0 * (6.0 * 0.08) ** 0.5, rel=0.05)
+    assert grown[1, 1] < 0.01 * grown[0, 0]
