@@ -6,6 +6,7 @@ models have no photogrammetric direction of distortion: such a camera is written
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -194,7 +195,21 @@ def read_cameras(path: Path) -> Rig:
         raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
     if not cameras:
         raise CaptureError(f"{path}: holds no cameras")
-    return Rig(tuple(cameras))
+    of = _images_beside(path.with_name("images.txt")) if len(cameras) > 1 else {}
+    return Rig(tuple(replace(one, images=of.get(one.name, ())) for one in cameras))
+
+
+def _images_beside(path: Path) -> dict[str, tuple[str, ...]]:
+    """Images of each camera by the images.txt of a model: every other line is IMAGE_ID, pose (7 numbers), CAMERA_ID, NAME."""
+    found: dict[str, list[str]] = {}
+    if path.is_file():
+        with open_text(path) as file:
+            lines = [line for line in file if not line.startswith("#")]
+        for line in lines[::2]:
+            words = line.split(maxsplit=9)
+            if len(words) == 10:
+                found.setdefault(f"cam{words[8]}", []).append(words[9].strip())
+    return {name: tuple(images) for name, images in found.items()}
 
 
 def _read_line(words: list[str], place: str) -> RigCamera:

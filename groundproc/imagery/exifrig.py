@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
 from typing import Final
 
 import numpy as np
 
 from groundproc.imagery.camera import POLYNOMIAL, RADTAN, Camera
 from groundproc.imagery.photos import Picture
-from groundproc.imagery.rig import Rig, RigCamera
+from groundproc.imagery.rig import Rig, RigCamera, band_name
 from groundproc.imagery.rotations import STRAIGHT_DOWN
 
 _DIAGONAL_35MM: Final = math.hypot(36.0, 24.0)
@@ -34,7 +36,42 @@ def rig_of(pictures: Sequence[Picture]) -> tuple[Rig, list[int], list[str]]:
             cameras.append(camera)
             notes += [note] if note else []
         numbers.append(keys[key])
-    return Rig(tuple(cameras)), numbers, notes
+    names = [picture.name for picture in pictures]
+    return named(Rig(tuple(cameras)), names, numbers), numbers, notes
+
+
+def named(rig: Rig, images: Sequence[str], camera: Sequence[int]) -> Rig:
+    """The rig with a prefix or a pattern for each camera, so that who reads it knows whose an image is; else with their names.
+
+    A folder or an ending (`*_NIR.TIF`) fits the next flight too.
+    """
+    if len(rig.cameras) < 2:
+        return rig
+    of = [[name for name, one in zip(images, camera, strict=True) if one == n] for n in range(len(rig.cameras))]
+    patterns = [_pattern(own, [name for name in images if name not in set(own)]) for own in of]
+    if all(patterns):
+        return Rig(tuple(replace(one, image_prefix=p) for one, p in zip(rig.cameras, patterns, strict=True)))
+    return Rig(tuple(replace(one, images=tuple(own)) for one, own in zip(rig.cameras, of, strict=True)))
+
+
+def _beginning(names: Sequence[str]) -> str:
+    """What all names begin with, letter by letter."""
+    low, high = min(names), max(names)
+    same = next((n for n, (a, b) in enumerate(zip(low, high, strict=False)) if a != b), min(len(low), len(high)))
+    return low[:same]
+
+
+def _pattern(own: Sequence[str], others: Sequence[str]) -> str:
+    """A folder, an ending or the beginning of a name that fits all of some names and none of others; empty where there is none."""
+    ends = _beginning([name[::-1] for name in own])[::-1]
+    ends = ends[max(ends.find("_"), ends.find("-"), 0) :]
+    begins = _beginning([PurePosixPath(name).stem for name in own]).rstrip("0123456789")
+    folder = _beginning(own).rpartition("/")[0]
+    for pattern in (f"{folder}/" if folder else "", f"*{ends}" if ends[:1] in ("_", "-") else "", begins):
+        probe = RigCamera("", Camera(1, 1, 1.0, (0.0, 0.0)), image_prefix=pattern)
+        if pattern and not any(letter in pattern.lstrip("*") for letter in "*?[") and not any(map(probe.takes, others)):
+            return pattern
+    return ""
 
 
 def _camera(picture: Picture, name: str) -> tuple[RigCamera, str]:
@@ -57,7 +94,13 @@ def _camera(picture: Picture, name: str) -> tuple[RigCamera, str]:
         "p1": 0.01,
         "p2": 0.01,
     }
-    return RigCamera(name, camera, estimate=_ESTIMATE, sigma=sigma), note
+    return RigCamera(name, camera, bands=_bands_of(picture), estimate=_ESTIMATE, sigma=sigma), note
+
+
+def _bands_of(picture: Picture) -> tuple[str, ...]:
+    """Bands as XMP names them."""
+    text = str(picture.tags.get("BandName", ""))
+    return tuple(map(band_name, text.split(","))) if text else ()
 
 
 def _pixels_a_mm(picture: Picture) -> float:
@@ -110,11 +153,10 @@ def _of_xmp(picture: Picture, name: str) -> RigCamera | None:
         delay_s = readout_s[0] * 1e-6 / height if readout_s and 0.0 < readout_s[0] < 1e6 else 0.0
     estimate = ("f", "pu", "pv", "k1", "k2") if camera.model == RADTAN else ("f", "pu", "pv")
     sigma = {"f": 0.01 * camera.focal_px, "pu": 0.005 * width, "pv": 0.005 * width, "k1": 0.05, "k2": 0.1}
-    band = str(tags.get("BandName", ""))
     relative = _numbers(tags.get("RigRelatives"))
     mat = mat_of_relatives(relative) @ STRAIGHT_DOWN if len(relative) == 3 else STRAIGHT_DOWN
     return RigCamera(
-        name, camera, mat, line_delay_s=delay_s, bands=tuple(band.split(",")) if band else (), estimate=estimate,
+        name, camera, mat, line_delay_s=delay_s, bands=_bands_of(picture), estimate=estimate,
         sigma={key: value for key, value in sigma.items() if key in estimate},
     )  # fmt: skip
 

@@ -47,11 +47,23 @@ def read_opensfm(path: Path) -> Rig:
         raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
     except (UnicodeDecodeError, ValueError, RecursionError):
         raise CaptureError(f"{path}: is no JSON") from None
+    of: dict[str, list[str]] = {}
     if isinstance(tree, list) and tree and isinstance(tree[0], Mapping) and "cameras" in tree[0]:
-        tree = tree[0]["cameras"]  # a reconstruction
+        shots = tree[0].get("shots")  # a reconstruction
+        for name, shot in shots.items() if isinstance(shots, Mapping) else ():
+            of.setdefault(str(shot.get("camera") if isinstance(shot, Mapping) else None), []).append(str(name))
+        tree = tree[0]["cameras"]
     if not isinstance(tree, Mapping) or not tree or not all(isinstance(one, Mapping) for one in tree.values()):
         raise CaptureError(f"{path}: holds no cameras of OpenSfM, expected names with projection_type, width, height")
-    return Rig(tuple(RigCamera(str(name), _camera(one, f"{path}: {name}")) for name, one in tree.items()))
+    several = len(tree) > 1
+    return Rig(
+        tuple(
+            RigCamera(
+                str(name), _camera(one, f"{path}: {name}"), images=tuple(of.get(str(name), ())) if several else ()
+            )
+            for name, one in tree.items()
+        )
+    )
 
 
 def _camera(one: Mapping[str, Any], place: str) -> Camera:

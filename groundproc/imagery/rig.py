@@ -90,6 +90,8 @@ class RigCamera:
     sigma : mapping of str to float
         Prior sigmas of those, and of boresight_deg, lever_arm_m, timeshift_s, line_delay_s.
     spread : Spread, optional
+    images : tuple of str
+        Images that are of this camera whatever they are called, where no prefix or pattern tells.
     """
 
     name: str
@@ -106,6 +108,7 @@ class RigCamera:
     estimate: tuple[str, ...] = ()
     sigma: Mapping[str, float] = field(default_factory=dict)
     spread: Spread | None = None
+    images: tuple[str, ...] = ()
 
     @property
     def lever_arm_m(self) -> Array:
@@ -132,10 +135,42 @@ class Rig:
 
     cameras: tuple[RigCamera, ...]
 
-    def camera_of(self, image: str) -> int | None:
-        """Number of the camera that an image is of: the one with the longest prefix; None where none takes it."""
-        taking = [(len(one.image_prefix), -number) for number, one in enumerate(self.cameras) if one.takes(image)]
-        return -max(taking)[1] if taking else None
+    def camera_of(self, image: str, size_px: tuple[int, int] | None = None) -> int | None:
+        """Number of the camera that an image is of; None where none takes it.
+
+        The one that lists it, else the one with the longest prefix; of several those of the picture's size, if it is known; then the
+        first.
+        """
+        listing = [number for number, one in enumerate(self.cameras) if image in one.images]
+        if listing:
+            return listing[0]
+        taking = self.taking(image, size_px)
+        return taking[0] if taking else None
+
+    def taking(self, image: str, size_px: tuple[int, int] | None = None) -> list[int]:
+        """Numbers of the cameras that could have taken an image, by prefix and size: more than one where neither tells."""
+        lengths = {number: len(one.image_prefix) for number, one in enumerate(self.cameras) if one.takes(image)}
+        longest = [number for number, length in lengths.items() if length == max(lengths.values())]
+        lenses = [self.cameras[number].camera for number in longest]
+        fitting = [n for n, one in zip(longest, lenses, strict=True) if (one.width_px, one.height_px) == size_px]
+        return fitting or longest
+
+
+_BANDS: Final = ("red", "green", "blue", "nir", "red_edge", "temperature")
+_OTHER_WORDS: Final = {
+    "rededge": "red_edge",
+    "near_infrared": "nir",
+    "nearinfrared": "nir",
+    "near_ir": "nir",
+    "thermal": "temperature",
+}
+
+
+def band_name(text: str) -> str:
+    """The name that indices and clouds know a band by, however its maker writes it (NIR, Red edge, RedEdge); others as they stand."""
+    plain = text.strip().lower().replace(" ", "_").replace("-", "_")
+    plain = _OTHER_WORDS.get(plain, plain)
+    return plain if plain in _BANDS else text.strip()
 
 
 # rig.yaml -------------------------------------------------------------------------------------------------------------
@@ -166,6 +201,7 @@ class Entry:
     timeshift_cam_imu: float = option(0.0, "t_utc = t_exif + shift [s]")
     line_delay_s: float = option(0.0, "rolling shutter, a row [s]")
     image_prefix: str = option("", "images whose path or name begins so")
+    images: tuple[str, ...] = option((), "images that are of it whatever they are called")
     bands: tuple[str, ...] = option((), "names of the planes of an image")
     response: Any = option(None, "how numbers follow the light")
     black_level: float | None = option(None, "number of no light")
@@ -203,7 +239,7 @@ def read_rig(path: Path) -> Rig:
 def _numbers(value: Any) -> Any:
     """A tree with texts such as 2e-5, which YAML takes for no number, as numbers; names are left."""
     if isinstance(value, Mapping):
-        names = ("image_prefix", "bands", "estimate", "camera_model", "distortion_model", "unknowns")
+        names = ("image_prefix", "images", "bands", "estimate", "camera_model", "distortion_model", "unknowns")
         return {key: item if key in names else _numbers(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_numbers(item) for item in value]
@@ -243,9 +279,10 @@ def _camera(name: str, entry: Entry, place: str) -> RigCamera:
         raise ConfigError(f"{place}: {error}") from None
     mat, origin = _transform(entry.T_cam_imu, place)
     return RigCamera(
-        name, camera, mat, origin, entry.timeshift_cam_imu, entry.line_delay_s, entry.image_prefix, entry.bands,
+        name, camera, mat, origin, entry.timeshift_cam_imu, entry.line_delay_s, entry.image_prefix,
+        tuple(map(band_name, entry.bands)),
         entry.response, entry.black_level, entry.vignetting, entry.estimate, _sigma(entry, camera, place),
-        _spread(entry.covariance, place),
+        _spread(entry.covariance, place), entry.images,
     )  # fmt: skip
 
 
@@ -349,8 +386,8 @@ def entry_of(one: RigCamera) -> dict[str, Any]:
     if any(camera.skew_px):
         entry["skew"] = _floats(camera.skew_px)
     optional = {
-        "image_prefix": one.image_prefix, "bands": list(one.bands), "response": one.response, "black_level": one.black_level,
-        "vignetting": one.vignetting, "estimate": list(one.estimate), "sigma": dict(one.sigma),
+        "image_prefix": one.image_prefix, "images": list(one.images), "bands": list(one.bands), "response": one.response,
+        "black_level": one.black_level, "vignetting": one.vignetting, "estimate": list(one.estimate), "sigma": dict(one.sigma),
     }  # fmt: skip
     entry |= {name: value for name, value in optional.items() if value not in (None, "", [], {})}
     if one.spread is not None:

@@ -183,9 +183,19 @@ def _with_cameras(task: Task, pictures: list[Picture], marks: list[Marks], start
         rig, numbers, notes = rig_of(pictures)
         return Session(names, pictures, np.array(numbers, np.int64), stamps, rig, warnings=notes)
     rig = load_rig(task.rig)
-    found = [rig.camera_of(name) for name in names]
+    sizes = [(one.width_px, one.height_px) for one in pictures] or [None] * len(names)
+    found = [rig.camera_of(name, size) for name, size in zip(names, sizes, strict=True)]
     camera = np.array([-1 if number is None else number for number in found], np.int64)
     session = Session(names, pictures, camera, stamps, rig)
+    listed = {name for one in rig.cameras for name in one.images}
+    taking = next(
+        (t for n, z in zip(names, sizes, strict=True) if n not in listed and len(t := rig.taking(n, z)) > 1), None
+    )
+    if taking is not None:
+        alike = ", ".join(rig.cameras[number].name for number in taking)
+        session.warnings.append(
+            f"{task.rig}: {alike} could each have taken the images, which count as those of the first; state image_prefix of each"
+        )
     session.keep(camera >= 0, "no camera of the rig has an image_prefix that fits")
     if pictures:
         _check_sizes(session)

@@ -259,10 +259,11 @@ def _looked_up(name: str, roots: Sequence[Path], rig: Rig) -> tuple[Path, int, p
     path = next((root / name for root in roots if (root / name).is_file()), None)
     if path is None:
         raise CaptureError(f"{name}: is not in {' or '.join(map(str, roots))}; --photos says where the pictures are")
-    which = rig.camera_of(name)
+    size = pictures.size_of(path)
+    which = rig.camera_of(name, (size.width_px, size.height_px))
     if which is None:
         raise CaptureError(f"{name}: is of no camera of the rig ({', '.join(one.name for one in rig.cameras)})")
-    size, camera = pictures.size_of(path), rig.cameras[which].camera
+    camera = rig.cameras[which].camera
     if (size.width_px, size.height_px) != (camera.width_px, camera.height_px):
         raise CaptureError(
             f"{path}: has {size.width_px} x {size.height_px} pixels, camera {rig.cameras[which].name} of the rig "

@@ -49,6 +49,21 @@ def test_opensfm_s_lengths_are_shares_of_the_longer_side(tmp_path: Path) -> None
     assert (second.focal_px, second.model) == (800.0, "equidistant")
 
 
+def test_whose_an_image_is_stands_in_the_models_of_other_programs(tmp_path: Path) -> None:
+    lines = "".join(camera_line(number, CAMERAS[0]) + "\n" for number in (1, 2))
+    (tmp_path / "cameras.txt").write_text(lines)
+    (tmp_path / "images.txt").write_text(
+        "# a comment\n1 1 0 0 0 0 0 0 2 a b.jpg\n\n2 1 0 0 0 0 0 0 1 c.jpg\n10 10 -1\n"
+    )
+    colmap = load_rig(tmp_path / "cameras.txt")
+    assert [colmap.camera_of(name) for name in ("c.jpg", "a b.jpg")] == [0, 1]
+    camera = {"projection_type": "perspective", "width": 10, "height": 10, "focal": 1.0, "k1": 0.0, "k2": 0.0}
+    tree = [{"cameras": {"p": camera, "q": camera}, "shots": {"a.jpg": {"camera": "q"}, "b.jpg": {"camera": "p"}}}]
+    (tmp_path / "reconstruction.json").write_text(json.dumps(tree))
+    opensfm = load_rig(tmp_path / "reconstruction.json")
+    assert [opensfm.camera_of(name) for name in ("a.jpg", "b.jpg")] == [1, 0]
+
+
 @pytest.mark.parametrize(
     ("name", "text", "word"),
     [

@@ -6,10 +6,12 @@ import rasterio
 from PIL import Image
 
 from flightlog.errors import CaptureError
-from groundproc.imagery.exifrig import rig_of
+from groundproc.imagery.camera import Camera
+from groundproc.imagery.exifrig import named, rig_of
 from groundproc.imagery.photos import Picture, files_of, look
 from groundproc.imagery.pictures import gray
 from groundproc.imagery.poses import NO_TIME
+from groundproc.imagery.rig import Rig, RigCamera, read_rig, write_rig
 
 
 def picture(path: Path, size: tuple[int, int] = (64, 48), exif: Image.Exif | None = None) -> Path:
@@ -123,7 +125,7 @@ def test_dji_images_say_where_they_were_and_how_they_looked(recordings: Path) ->
     assert 700 < rig.cameras[0].camera.focal_px < 1100
 
 
-def test_the_sequoia_s_cameras_are_those_of_its_xmp(recordings: Path) -> None:
+def test_the_sequoia_s_cameras_are_those_of_its_xmp(recordings: Path, tmp_path: Path) -> None:
     folder = recordings / "images" / "garfield"
     pictures = [one for one in look(files_of([folder])) if isinstance(one, Picture)]
     rig, numbers, notes = rig_of(pictures)
@@ -131,9 +133,32 @@ def test_the_sequoia_s_cameras_are_those_of_its_xmp(recordings: Path) -> None:
     assert len(pictures) == len(numbers)
     assert len(rig.cameras) == 5
     by_band = {one.bands: one for one in rig.cameras}
-    nir = by_band[("NIR",)].camera
+    assert set(by_band) == {("red",), ("green",), ("nir",), ("red_edge",), ("red", "green", "blue")}
+    # who reads what is written knows whose an image is
+    write_rig(tmp_path / "rig.yaml", rig)
+    again = read_rig(tmp_path / "rig.yaml")
+    assert [again.camera_of(one.name) for one in pictures] == numbers
+    assert {one.image_prefix for one in again.cameras} == {"*_RED.TIF", "*_GRE.TIF", "*_NIR.TIF", "*_REG.TIF", "rgb/"}
+    nir = by_band[("nir",)].camera
     assert nir.model == "fisheye_polynomial"
     np.testing.assert_allclose(nir.focal_px * np.pi / 2, 1671.556624069)
     np.testing.assert_allclose(nir.centre_px[0], 2.544297 / 0.00375 - 0.5, atol=0.1)
     rgb = next(one for one in rig.cameras if one.camera.model == "radtan")
     np.testing.assert_allclose(rgb.line_delay_s * rgb.camera.height_px, 0.0475)
+
+
+@pytest.mark.parametrize(
+    ("images", "prefixes"),
+    [
+        (("a/1.jpg", "b/1.jpg"), ["a/", "b/"]),
+        (("left_1.jpg", "right_1.jpg", "left_2.jpg"), ["left_", "right_"]),
+        (("DJI_0001.jpg", "DJI_0002.jpg", "DJI_0003.jpg"), ["", ""]),
+    ],
+)
+def test_a_rig_of_several_cameras_says_whose_an_image_is(images: tuple[str, ...], prefixes: list[str]) -> None:
+    """By folders or names where these tell, else one by one."""
+    camera = Camera(10, 10, 10.0, (4.5, 4.5))
+    numbers = [0, 1, 0][: len(images)]
+    rig = named(Rig((RigCamera("a", camera), RigCamera("b", camera))), images, numbers)
+    assert [rig.camera_of(name) for name in images] == numbers
+    assert [one.image_prefix for one in rig.cameras] == prefixes

@@ -84,6 +84,16 @@ def test_the_longest_prefix_takes_an_image(tmp_path: Path) -> None:
     assert Rig(rig.cameras[1:]).camera_of("x.jpg") is None
 
 
+def test_of_cameras_that_no_prefix_tells_apart_the_size_of_the_picture_does(tmp_path: Path) -> None:
+    small, large = (f"  intrinsics: [10, 10, 5, 5]\n  resolution: [{width}, 10]\n" for width in (10, 20))
+    rig = written(tmp_path, f"a:\n{small}b:\n{large}c:\n{small}  bands: [NIR, Red edge, mine]\n  images: [x.jpg]\n")
+    assert rig.camera_of("y.jpg", (20, 10)) == 1
+    assert rig.camera_of("y.jpg") == 0
+    assert rig.taking("y.jpg", (10, 10)) == [0, 2]
+    assert rig.camera_of("x.jpg", (20, 10)) == 2
+    assert rig.cameras[2].bands == ("nir", "red_edge", "mine")
+
+
 def test_a_covariance_is_kept(tmp_path: Path) -> None:
     rig = written(tmp_path, KALIBR + "  covariance: {unknowns: [f, lever_x], matrix: [[4, 1], [1, 9]]}\n")
     spread = rig.cameras[1].spread
