@@ -183,13 +183,14 @@ def _with_cameras(task: Task, pictures: list[Picture], marks: list[Marks], start
         rig, numbers, notes = rig_of(pictures)
         return Session(names, pictures, np.array(numbers, np.int64), stamps, rig, warnings=notes)
     rig = load_rig(task.rig)
-    sizes = [(one.width_px, one.height_px) for one in pictures] or [None] * len(names)
+    sizes: list[tuple[int, int] | None] = [(one.width_px, one.height_px) for one in pictures]
+    sizes = sizes or [None] * len(names)
     found = [rig.camera_of(name, size) for name, size in zip(names, sizes, strict=True)]
     camera = np.array([-1 if number is None else number for number in found], np.int64)
     session = Session(names, pictures, camera, stamps, rig)
-    listed = {name for one in rig.cameras for name in one.images}
+    own = {name for one in rig.cameras for name in one.images}
     taking = next(
-        (t for n, z in zip(names, sizes, strict=True) if n not in listed and len(t := rig.taking(n, z)) > 1), None
+        (t for n, z in zip(names, sizes, strict=True) if n not in own and len(t := rig.taking(n, z)) > 1), None
     )
     if taking is not None:
         alike = ", ".join(rig.cameras[number].name for number in taking)
