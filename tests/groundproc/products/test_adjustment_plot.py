@@ -104,7 +104,7 @@ def test_a_picture_is_drawn_with_and_without_parameters(sheet: Sheet, tmp_path: 
         moved_m=no_rows, turned_rad=no_rows,
     )  # fmt: skip
     for one in (sheet, bare):
-        draw_sheet(one).savefig(tmp_path / "adjustment.png", dpi=90)
+        draw_sheet(one).savefig(tmp_path / "adjustment.png")
         head = (tmp_path / "adjustment.png").read_bytes()[:24]
         assert head[:8] == b"\x89PNG\r\n\x1a\n"
         heights.append(struct.unpack(">II", head[16:24])[1])
