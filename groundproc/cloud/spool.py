@@ -99,12 +99,19 @@ class Spool:
             at += len(packed)
         if many and self._bytes > _WAITING_BYTES // 2:  # very many squares with few records each
             self._write()
+        # what waits on is a part of arrays with many squares' records, which it would keep in memory
+        self._waiting = {place: [_copied(parts)] for place, parts in self._waiting.items()}
 
 
 def _joined(parts: list[Records]) -> Records:
-    """Records one after the other, copied as bytes: numpy copies structures field by field."""
+    """Records one after the other."""
+    return parts[0] if len(parts) == 1 else _copied(parts)
+
+
+def _copied(parts: list[Records]) -> Records:
+    """Records one after the other in memory of their own, copied as bytes: numpy copies structures field by field."""
     whole = f"V{parts[0].dtype.itemsize}"
-    return parts[0] if len(parts) == 1 else np.concatenate([each.view(whole) for each in parts]).view(parts[0].dtype)
+    return np.concatenate([each.view(whole) for each in parts]).view(parts[0].dtype)
 
 
 def _bytes_of(records: Records) -> npt.NDArray[np.uint8]:
