@@ -156,6 +156,7 @@ def bridged(made: Trajectory, begun: Trajectory, parts: Sequence[Stretch]) -> Tr
             (made.position_m[here], made.quat_local_ins_wxyz[here]),
             (poses.position_m, poses.quat_local_ins_wxyz),
             _shares(seconds, each),
+            turned=each.held_before and each.held_after,
         )
         if len(rest):
             turn = frames.quat_multiply(quat[[last]], frames.quat_inverse(was[1][None]))
@@ -194,15 +195,18 @@ def _away(seconds: Array, each: Stretch) -> Array:
     return np.asarray(np.minimum(since, until))
 
 
-def _laid(good: tuple[Array, Array], motion: tuple[Array, Array], share: Array) -> tuple[Array, Array]:
-    """Positions and attitudes of a motion, shapes (n, 3) and (n, 4), turned and moved so that both its ends lie on good poses."""
+def _laid(good: tuple[Array, Array], motion: tuple[Array, Array], share: Array, *, turned: bool) -> tuple[Array, Array]:
+    """Positions and attitudes of a motion, shapes (n, 3) and (n, 4), moved and turned so that its ends lie on good poses.
+
+    With one good end the way is moved and not `turned`: a smoother has it from fixes, and what its heading is off has not turned it.
+    """
     (place, quat), (way, turn) = good, motion
     off = frames.quat_multiply(quat, frames.quat_inverse(turn))
     between = frames.quat_log(frames.quat_multiply(frames.quat_inverse(off[:1]), off[-1:]))
-    turned = frames.quat_multiply(np.repeat(off[:1], len(off), axis=0), frames.quat_exp(share[:, None] * between))
+    offs = frames.quat_multiply(np.repeat(off[:1], len(off), axis=0), frames.quat_exp(share[:, None] * between))
     laid = []
     for end in (0, -1):
-        mat = frames.mat_from_quat(off[[end]])[0]
+        mat = frames.mat_from_quat(off[[end]])[0] if turned else np.eye(3)
         laid.append(place[end] + (way - way[end]) @ mat.T)
     position = laid[0] + share[:, None] * (laid[1] - laid[0])
-    return position, frames.quat_multiply(turned, turn)
+    return position, frames.quat_multiply(offs, turn)

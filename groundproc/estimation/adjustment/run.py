@@ -151,7 +151,7 @@ class Run:
         # a path that is not handed back need not settle
         if moved > UNSETTLED_M and not self.is_blind():
             found.append(
-                f"the last step still moved the path by {moved * 1e3:.0f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
+                f"the last step still moved the path by {moved * 1e3:.1f} mm, expected under {UNSETTLED_M * 1e3:.0f}; it has not settled"
             )
         found += self._untold()
         outcome = self.outcome()
