@@ -30,26 +30,27 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 LONGEST = (
-    "end_to_end/test_process.py",
     "end_to_end/test_adjusted.py",
     "groundproc/steps/test_images.py",
-    "end_to_end/test_estimate_folder.py",
+    "end_to_end/test_process.py",
     "end_to_end/test_live.py",
     "groundproc/estimation/test_filtered.py",
     "groundproc/strips/test_adjust_command.py",
-    "groundproc/campaign/test_batch.py",
-    "end_to_end/test_adjusted_anchored.py",
+    "groundproc/imagery/test_on_trajectory.py",
     "groundproc/steps/test_steps.py",
-    "end_to_end/test_adjusted_natural.py",
-    "groundproc/analysis/test_smooth_command.py",
+    "groundproc/campaign/test_batch.py",
+    "end_to_end/test_estimate_folder.py",
     "end_to_end/test_dynamic.py",
-    "end_to_end/test_bare_install.py",
-    "end_to_end/test_package.py",
-    "groundproc/analysis/test_section_and_fuse.py",
-    "groundproc/assessment/test_targets.py",
+    "end_to_end/test_adjusted_anchored.py",
+    "groundproc/analysis/test_smooth_command.py",
+    "groundproc/imagery/test_hamlet.py",
     "end_to_end/test_pull.py",
+    "end_to_end/test_package.py",
+    "end_to_end/test_bare_install.py",
+    "groundproc/assessment/test_targets.py",
+    "groundproc/analysis/test_section_and_fuse.py",
 )
-"""Files that take half a minute and more, the longest first."""
+"""Files that take half a minute and more, the longest first; files of one flight apart, or the second waits for the first to make it."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
