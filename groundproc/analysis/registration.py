@@ -111,13 +111,14 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
     about = np.round(a_m.mean(axis=0))
     a, b = a_m - about, b_m - about
     surface, other = _smoothed(a, what), _smoothed(b, what)
+    tree = cKDTree(surface.xyz)
     step = max(1, len(other.xyz) // _SAMPLE)
     sample = other.xyz[::step]
     matrix, covariance, residual_m = np.eye(4), np.diag(_PRIOR**2), 0.0
     overlap = 0.0
     for number, reach in enumerate(_STAGES_M):
         moved = sample @ matrix[:3, :3].T + matrix[:3, 3]
-        distance, nearest = surface.tree.query(moved, distance_upper_bound=reach)
+        distance, nearest = tree.query(moved, distance_upper_bound=reach)
         near = np.isfinite(distance)
         if number == 0:
             overlap = float(near.mean())
@@ -134,7 +135,7 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = Rotation.from_rotvec(step_m[3:]).as_matrix(), step_m[:3]
         matrix = change @ matrix
-    fit = _fit(surface, sample @ matrix[:3, :3].T + matrix[:3, 3])
+    fit = _fit(surface, tree, sample @ matrix[:3, :3].T + matrix[:3, 3])
     if fit < _LEAST_FIT:
         raise CoverageError(
             f"{what}: {fit:.0%} of the points next to each other lie on one surface, expected {_LEAST_FIT:.0%} or more: "
@@ -152,19 +153,18 @@ def _smoothed(xyz: Array, what: str) -> "_Surface":
             f"{what}: {int(good.sum())} points on surfaces found, expected {_FEWEST} or more to lay them on each other"
         )
     on = xyz[good] - planes.off_m[good, None] * planes.normal[good]
-    return _Surface(cKDTree(on), on, planes.normal[good], planes.roughness_m[good])
+    return _Surface(on, planes.normal[good], planes.roughness_m[good])
 
 
 @dataclass(frozen=True, slots=True)
 class _Surface:
-    tree: Any
     xyz: Array
     normal: Array
     rough: Array
 
     def some(self, rows: npt.NDArray[Any]) -> "_Surface":
         """Places and planes of some of its points."""
-        return _Surface(None, self.xyz[rows], self.normal[rows], self.rough[rows])
+        return _Surface(self.xyz[rows], self.normal[rows], self.rough[rows])
 
     def over(self, xyz: Array, nearest: npt.NDArray[Any]) -> Array:
         """Distance of points from the planes at points of A."""
@@ -191,13 +191,21 @@ def _adjust(
     step = told @ np.linalg.solve(told.T @ (hessian + np.eye(6)) @ told, told.T @ right)
     step -= untold @ np.linalg.solve(untold.T @ untold, untold.T @ (gone + step))
     left = over + rows @ step
-    _, group = np.unique(np.floor(moved / _GROUP_M).astype(np.int64), axis=0, return_inverse=True)
-    group = group.ravel()
+    group = _groups(moved)
     inverse = told @ np.linalg.solve(told.T @ (hessian - noise + np.eye(6)) @ told, told.T)
     covariance = inverse @ (_scatter(rows, weight, left, group) + np.eye(6)) @ inverse
     covariance += _split(rows, scale, left, told, group, (noise + np.eye(6)) @ told, covariance)
     covariance += untold @ np.linalg.solve(untold.T @ untold, untold.T)
     return step * _PRIOR, covariance * np.outer(_PRIOR, _PRIOR), sigma(left)
+
+
+def _groups(moved: Array) -> npt.NDArray[np.int64]:
+    """Numbers of the cubes of some metres that points lie in, from 0."""
+    cube = np.floor(moved / _GROUP_M).astype(np.int64)
+    cube -= cube.min(axis=0)
+    size = cube.max(axis=0) + 1
+    _, number = np.unique((cube[:, 0] * size[1] + cube[:, 1]) * size[2] + cube[:, 2], return_inverse=True)
+    return np.asarray(number.ravel(), np.int64)
 
 
 def _scales(over: Array, rough: Array) -> Array:
@@ -264,9 +272,9 @@ def _split(
     return out
 
 
-def _fit(surface: _Surface, moved: Array) -> float:
+def _fit(surface: _Surface, tree: Any, moved: Array) -> float:
     """Share of the points next to A that lie on it."""
-    distance, nearest = surface.tree.query(moved, distance_upper_bound=1.0)
+    distance, nearest = tree.query(moved, distance_upper_bound=1.0)
     near = np.isfinite(distance)
     if near.sum() < _FEWEST:
         return 0.0

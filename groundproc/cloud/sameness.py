@@ -51,7 +51,9 @@ def agreed_map_crs(clouds: Sequence[Cloud], given: pyproj.CRS | None) -> pyproj.
         crs = cloud.horizontal if crs is None else crs
     assert crs is not None
     if not crs.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
-        raise CaptureError(f"{clouds[0].path}: is in {crs.name}, expected a projected CRS in metres; `swath transform` makes it")
+        raise CaptureError(
+            f"{clouds[0].path}: is in {crs.name}, expected a projected CRS in metres; `swath transform` makes it"
+        )
     return crs
 
 
