@@ -59,6 +59,8 @@ def test_figures_table_and_pictures_of_a_short_flight(judged_flight: Any, tmp_pa
         assert (out / f"{name}.png").stat().st_size > 10_000, name
 
 
+# the benchmark started once more; in the quick suite: its figures, table and pictures (above)
+@pytest.mark.soak
 def test_a_method_that_fails_says_why_and_the_others_go_on(judged_flight: Any, tmp_path: Path) -> None:
     import trajectory
 

@@ -193,6 +193,8 @@ def test_it_agrees_with_the_causal_method_on_the_log(
     assert np.sqrt(np.square(off).sum(axis=1).mean()) < POSITION_RMS_M
 
 
+# the flight followed once more; in the quick suite: the smoother with one unit only (test_filtered), and the live view with both
+@pytest.mark.soak
 def test_without_the_lidars_own_unit_the_autopilots_carries_it(tmp_path: Path, flight: Any) -> None:
     """No position packets, as where port 8308 is not sent down: RAW_IMU at 25 Hz, on clocks tied by receive times."""
     bare = tmp_path / "bare.mcap"

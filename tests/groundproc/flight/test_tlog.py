@@ -39,7 +39,15 @@ def test_the_link_number_in_the_stamp_is_no_time(link: int) -> None:
     assert count == TlogCount(records=4, frames=4)
 
 
-@pytest.mark.parametrize("name", ["copter_flight_2015", "ardusub_2023", "arducopter313_sim"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        # the longest; its frames are those that pymavlink finds in the quick suite too (flightlog/test_mavlink)
+        pytest.param("copter_flight_2015", marks=pytest.mark.soak),
+        "ardusub_2023",
+        "arducopter313_sim",
+    ],
+)
 def test_frames_and_bad_frames_are_those_that_pymavlink_finds(recordings: Path, name: str) -> None:
     path = recordings / "mavlink" / f"{name}.tlog"
     found, count = read(path.read_bytes())

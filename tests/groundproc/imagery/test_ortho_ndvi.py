@@ -34,6 +34,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+# a second mosaic of a second scene; in the quick suite: every pixel of a mosaic to a fifth of its size (test_foreign)
+@pytest.mark.soak
 def test_a_mosaic_shows_every_place_where_it_is(place: Path) -> None:
     """Pixels of 0.2 m: the picture is that of the scene seen from straight above, roof and ground, but for the roof's edge."""
     out = place / "ortho.tif"

@@ -201,6 +201,8 @@ def test_control_points_bring_the_whole_to_its_place(
     assert abs(np.median(off)) < 0.02
 
 
+# one more adjustment; in the quick suite: how strips are cut, and stamps of the week (test_strips_parts)
+@pytest.mark.soak
 def test_several_files_with_seconds_of_the_week_and_their_own_strips(
     tmp_path: Path, wrong_scan: aerial.Scan, adjusted: Any
 ) -> None:
