@@ -1,5 +1,6 @@
 """Nodes of an octree: every point in one node that contains it, parents coarser than children, in bounded pieces."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -113,3 +114,22 @@ def test_a_spool_gives_back_what_it_took_though_it_wrote_in_between(
     for each in range(9):
         np.testing.assert_array_equal(spool.take((each, -each)), points[place == each])
     assert not spool.counts
+
+
+def test_a_spool_keeps_no_more_in_memory_than_what_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each piece has one record of a square that is hardly met, which waits on: the rest of the piece does not wait with it."""
+    monkeypatch.setattr("groundproc.cloud.spool._WAITING_BYTES", 1 << 20)
+    spool = Spool(RECORD, tmp_path)
+    points = records(20_000, (50.0, 50.0, 2.0))
+    number = np.zeros(len(points), np.int32)
+    number[0] = 1
+    spool.add_sorted(points, number, [(0, 0), (1, -1)])  # compiled code takes memory too
+    spool._write()
+    tracemalloc.start()
+    try:
+        for each in range(100):
+            spool.add_sorted(points, number, [(0, 0), (1, each)])
+        held = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert held < (1 << 20) + 4 * points.nbytes < 20 * points.nbytes
