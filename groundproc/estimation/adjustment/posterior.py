@@ -159,12 +159,10 @@ class Posterior:
         """Covariance of some globals were the rows' weights right, shape (m, m): columns of the normal matrix's inverse."""
         places = np.concatenate([np.arange(self.unknowns.names[n].start, self.unknowns.names[n].stop) for n in names])
         prior = np.concatenate([self.unknowns.sigma[n] for n in names])
-        columns = np.empty((len(places), len(places)))
-        for i, place in enumerate(places):
-            right = np.zeros(self.unknowns.size)
-            # what is gained is then the variance, in the prior's
-            right[place] = 1.0 / prior[i]
-            columns[i] = self.problem.solve(right, EXACT)[0][places] * prior[i]
+        rights = np.zeros((self.unknowns.size, len(places)))
+        # what is gained is then the variance, in the prior's
+        rights[places, np.arange(len(places))] = 1.0 / prior
+        columns = self.problem.solve_all(rights, EXACT)[places] * prior
         return np.asarray(0.5 * (columns + columns.T))
 
 
@@ -187,9 +185,7 @@ def whole_covariance(posterior: Posterior, path: Path) -> Array:
     asked[unknowns.names["world.shift"], 3:] = np.eye(3)
     # in degrees and metres, so that what a solution may leave out is little of each
     scale = np.array([np.deg2rad(1.0)] * 3 + [1.0] * 3)
-    found = np.empty((6, 6))
-    for i in range(6):
-        found[i] = asked.T @ posterior.problem.solve(asked[:, i] / scale[i], WHOLE)[0] * scale[i]
+    found = asked.T @ (posterior.problem.solve_all(asked / scale, WHOLE) * scale)
     return np.asarray(0.5 * (found + found.T))
 
 

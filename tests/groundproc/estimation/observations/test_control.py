@@ -332,9 +332,9 @@ def test_the_whole_is_what_world_and_spline_make_together(path: Path, by_spline:
         motion[unknowns.path_size :] = np.eye(6)
 
     class Known:
-        def solve(self, right: Array, enough: float) -> tuple[Array, int]:
+        def solve_all(self, rights: Array, enough: float) -> Array:
             assert enough < 1e-4
-            return motion @ (wanted @ (motion.T @ right)), 1
+            return np.asarray(motion @ (wanted @ (motion.T @ rights)))
 
     known: Any = Known()
     np.testing.assert_allclose(whole_covariance(Posterior(known, unknowns, []), path), wanted, rtol=1e-9, atol=1e-9)
