@@ -111,7 +111,7 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
     about = np.round(a_m.mean(axis=0))
     a, b = a_m - about, b_m - about
     surface, other = _smoothed(a, what), _smoothed(b, what)
-    tree = cKDTree(surface.xyz)
+    tree: Any = cKDTree(surface.xyz)
     step = max(1, len(other.xyz) // _SAMPLE)
     sample = other.xyz[::step]
     matrix, covariance, residual_m = np.eye(4), np.diag(_PRIOR**2), 0.0

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from flightlog import __version__
 from flightlog.errors import CaptureError, CoverageError, UsageError
 from groundproc.cloud import reader
-from groundproc.cloud.metres import Metres, metres_of
+from groundproc.cloud.metres import Metres, metres_of, unstated
 from groundproc.cloud.reader import Cloud
 from groundproc.cloud.rewriter import Rewriter
 from groundproc.cloud.selection import standing
@@ -159,6 +159,7 @@ def work(task: Task, progress: Progress) -> Made:
     with written_aside(task.output) as aside:
         scale, low, high = _measured(cloud, metres, task.sigma_m, progress)
         made = Made(cloud.points, scale)
+        made.warnings += unstated(cloud)
         side = side_for(cloud.points, low.tolist(), high.tolist(), scale.halo_m)
         tiles = Tiles(task.output.parent, _KEPT, side, scale.halo_m)
         for chunk in reader.chunks(cloud, columns=("classification", "mixed")):

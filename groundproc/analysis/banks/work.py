@@ -20,6 +20,7 @@ from groundproc.analysis.banks.stations import around
 from groundproc.analysis.banks.waterline import WaterLine
 from groundproc.analysis.terrain.surfaces import blocks
 from groundproc.cloud import reader
+from groundproc.cloud.metres import unstated
 from groundproc.files import written_aside
 from groundproc.raster.relief import filled
 from groundproc.vectors.features import Features, write_features
@@ -124,6 +125,7 @@ def work(task: Task, progress: Progress) -> Made:
     _check(task)
     clouds = [reader.look(each) for each in ([] if task.before is None else [task.before]) + [task.cloud]]
     made, folder = Made(len(clouds)), task.output.parent
+    made.warnings += unstated(*clouds)
     with written_aside(task.output) as aside:
         ground = Ground(clouds, task.registered, folder, progress, task.terrain)
         made.registration_sigma_m = ground.registration_sigma_m

@@ -214,6 +214,9 @@ TOLD = [
     ("wires nocrs.laz -o o.geojson", TAKEN),
     ("trees nocrs.laz -o o.geojson", TAKEN),
     ("pipes nocrs.laz -o o.geojson", TAKEN),
+    ("banks nocrs.laz -o o.geojson", TAKEN),
+    ("banks nocrs.laz --before a.laz -o o.geojson", AS_OTHER),
+    ("smooth nocrs.laz -o o.laz", TAKEN),
     ("moving nocrs.laz -o o.geojson", TAKEN),
     ("passability nocrs.laz -o o", TAKEN),
     (
