@@ -179,7 +179,9 @@ def whole_offset_ns(trajectory: Trajectory, time_ns: Ints) -> int:
     return best * _QUARTER_NS if most > 0 else 0
 
 
-def stations_of(trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints) -> tuple[Known, Mask]:
+def stations_of(
+    trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints, whole: bool = False
+) -> tuple[Known, Mask]:
     """Stations and observed poses of images; images of several cameras with one stamp share a station.
 
     Parameters
@@ -190,6 +192,8 @@ def stations_of(trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints) -
     camera : ndarray of int64, shape (i,)
     time_ns : ndarray of int64, shape (i,)
         Stamps, all known.
+    whole : bool
+        They are cut off to whole seconds.
 
     Returns
     -------
@@ -213,11 +217,11 @@ def stations_of(trajectory: Trajectory, rig: Rig, camera: Ints, time_ns: Ints) -
         station_time, sampled.place_m, sampled.mat_local_ins, sampled.velocity_m_s, sampled.rate_rad_s, lead
     )
     rows = np.flatnonzero(sampled.covered)
-    covariance = _stamped(trajectory, station_time + _shift_ns(rig, lead), sampled, whole_seconds(time_ns))
+    covariance = _stamped(trajectory, station_time + _shift_ns(rig, lead), sampled, whole)
     priors = PosePriors(
         rows, sampled.place_m[rows], sampled.mat_local_ins[rows], covariance[rows], np.zeros((len(rows), 3)),
         sampled.velocity_m_s[rows], np.einsum("kij,kj->ki", sampled.mat_local_ins[rows], sampled.rate_rad_s[rows]),
-        np.ones(len(rows)), common=Common(covariance=trajectory.datum),
+        np.ones(len(rows)), common=Common(covariance=trajectory.datum, whole=whole),
     )  # fmt: skip
     covered = sampled.covered[station]
     return Known(covered.copy(), stations, station, priors), covered
@@ -259,7 +263,7 @@ def resampled(trajectory: Trajectory, block: Block) -> Block:
             priors,
             place_m=sampled.place_m,
             mat_local_ins=later.mat_local_ins,
-            covariance=_stamped(trajectory, time_ns, sampled, whole_seconds(stations.time_ns)),
+            covariance=_stamped(trajectory, time_ns, sampled, priors.common.whole),
             velocity_m_s=sampled.velocity_m_s,
             turning_rad_s=np.einsum("kij,kj->ki", later.mat_local_ins, later.rate_rad_s),
         ),

@@ -98,6 +98,8 @@ class Session:
     own_cloud : bool
         The cloud lies in the folder of the trajectory, which it was made with.
     site : Site
+    whole : bool
+        Stamps are the images' own, and cut off to whole seconds.
     timed : Timed, optional
         By which events times were found.
     lasting : Lasting
@@ -119,6 +121,7 @@ class Session:
     late_sigma_s: float = 0.0
     own_cloud: bool = False
     site: Site = field(default_factory=lambda: cartesian(np.zeros((1, 3))))
+    whole: bool = False
     timed: Timed | None = None
     lasting: Lasting = field(default_factory=Lasting)
     warnings: list[str] = field(default_factory=list)
@@ -243,7 +246,9 @@ def _timed(session: Session, task: Task, progress: Progress) -> None:
             hours = -offset_ns / 3.6e12
             session.warnings.append(f"the cameras' clocks show local time, {hours:+g} h from UTC: taken off")
             session.time_ns = np.where(session.time_ns == NO_TIME, NO_TIME, session.time_ns + offset_ns)
-    if flown.whole_seconds(session.time_ns):
+    # events that lie on whole seconds were triggered there; a picture's own clock cuts off what is below
+    session.whole = timed is None and flown.whole_seconds(session.time_ns)
+    if session.whole:
         session.warnings.append(
             "the times of the images are whole seconds: their places along the flight count for half a second's way; give --times, or a "
             "log that notes exposures, to know better"
@@ -313,10 +318,14 @@ def _cloud_crs(cloud: Path | None) -> str | None:
 def known_of(session: Session) -> Known:
     """Poses before the adjustment."""
     if session.trajectory is not None:
-        known, covered = flown.stations_of(session.trajectory, session.rig, session.camera, session.time_ns)
+        known, covered = flown.stations_of(
+            session.trajectory, session.rig, session.camera, session.time_ns, session.whole
+        )
         if not covered.all():
             session.keep(covered, "was taken outside of the trajectory")
-            known, _ = flown.stations_of(session.trajectory, session.rig, session.camera, session.time_ns)
+            known, _ = flown.stations_of(
+                session.trajectory, session.rig, session.camera, session.time_ns, session.whole
+            )
         return known
     if (
         session.pictures

@@ -146,6 +146,8 @@ class Common:
         Of `moved` before; None: it is held.
     cloud : bool
         The lidar's planes were made with the trajectory, and are off with it.
+    whole : bool
+        Stamps of stations are cut off to whole seconds.
     """
 
     late_s: float = 0.0
@@ -154,6 +156,7 @@ class Common:
     moved: Array = field(default_factory=lambda: np.zeros(POSE))
     covariance: Array | None = None
     cloud: bool = False
+    whole: bool = False
 
     def shift_m(self, places_m: Array) -> Array:
         """How far places, shape (n, 3), are moved."""

@@ -136,21 +136,29 @@ def load(folder: Path, photos: Path | None, crs: pyproj.CRS | None, cloud: Path)
     place_m = site.local(poses.place_m)
     mat_local_cam = site.mat_local_grid(place_m) @ poses.mat_grid_camera()
     roots = [photos] if photos is not None else [folder, *_found_before(folder)]
-    of_camera = np.array(
-        [which if (which := rig.camera_of(name)) is not None else -1 for name in poses.images], np.int64
-    )
-    moves, unknown = _rolling(rig, of_camera, poses, place_m)
-    left_out: list[str] = [*unknown]
-    layers: dict[tuple[tuple[str, ...], np.dtype[Any]], list[Image]] = {}
+    left_out: list[str] = []
+    looked: dict[int, tuple[Path, int, pictures.Size]] = {}
     for number, name in enumerate(poses.images):
         try:
-            path, which, size = _looked_up(name, roots, rig)
+            looked[number] = _looked_up(name, roots, rig)
+        except CaptureError as error:
+            left_out.append(str(error))
+    by_name = [
+        rig.camera_of(name) for name in poses.images
+    ]  # of a picture that is not here too: it tells how fast others moved
+    of_camera = [looked[n][1] if n in looked else -1 if named is None else named for n, named in enumerate(by_name)]
+    moves, unknown = _rolling(rig, np.array(of_camera, np.int64), poses, place_m)
+    layers: dict[tuple[tuple[str, ...], np.dtype[Any]], list[Image]] = {}
+    for number, (path, which, size) in looked.items():
+        camera = rig.cameras[which]
+        eye = eye_of(camera.camera, mat_local_cam[number], place_m[number], moves[number])
+        try:
+            bands = _bands(camera, size.planes, path)
         except CaptureError as error:
             left_out.append(str(error))
             continue
-        camera = rig.cameras[which]
-        image = Image(name, path, which, eye_of(camera.camera, mat_local_cam[number], place_m[number], moves[number]))
-        layers.setdefault((_bands(camera, size.planes, path), size.dtype), []).append(image)
+        layers.setdefault((bands, size.dtype), []).append(Image(poses.images[number], path, which, eye))
+    left_out += unknown
     if not layers:
         reason = left_out[0] if left_out else "there are none"
         raise CaptureError(f"{folder}: none of {len(poses)} images can be used ({reason})")
