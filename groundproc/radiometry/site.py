@@ -12,6 +12,7 @@ import shapely
 
 from flightlog.errors import CaptureError, CoverageError, UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.metres import metres_of
 from groundproc.cloud.reader import Chunk, Cloud
 from groundproc.cloud.sameness import agreed_map_crs
 from groundproc.radiometry import sensorpath, signal
@@ -148,6 +149,9 @@ def look(task: Task, progress: Progress) -> Site:
     if crs is None and (task.trajectory is not None or task.targets is not None):
         crs = agreed_map_crs(clouds, None)
     for cloud in clouds:
+        unit = metres_of(cloud)
+        if crs is None and not unit.plain:
+            raise CaptureError(f"{cloud.path}: is in {unit.name}, expected metres; `swath transform` makes them")
         if not cloud.timed:
             raise CaptureError(f"{cloud.path}: its points have no gps_time, by which the place of the sensor is known")
     path: SensorPath | None = None

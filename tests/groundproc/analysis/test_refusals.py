@@ -60,6 +60,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud("utm32.laz", crs=25832)
     cloud("degrees.laz", crs=4326)
     cloud("geocentric.laz", crs=4978)
+    cloud("feet.laz", crs=2264)
     cloud("one.laz", shape=xyz[:1])
     cloud("row.laz", shape=np.column_stack([np.linspace(0, SIDE_M, 500), np.full(500, 9.9), np.full(500, 100.0)]))
     cloud("stray.laz", shape=np.concatenate([xyz[1:], xyz[:1] + np.array([9e5, 9e5, 0])]))
@@ -131,6 +132,8 @@ REFUSED = [
         r"dark\.laz: its points have no intensity, expected the strength of each echo",
     ),
     ("reflectance untimed.laz -t t.csv -o o", UNTIMED),
+    ("reflectance degrees.laz -o o", DEGREES),
+    ("reflectance feet.laz -o o", r"feet\.laz: is in US survey foot, expected metres; `swath transform` makes them"),
     ("orthophoto dark.laz --attribute intensity -o o.tif", r"dark\.laz: intensity is 0 for all points"),
     ("orthophoto a.laz -o o.tif", r"a\.laz: has no reflectance, .*`swath reflectance` makes it"),
     ("orthophoto a.laz utm32.laz --attribute intensity -o o.tif", DIFFERENT),
