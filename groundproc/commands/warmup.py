@@ -71,11 +71,13 @@ def _compile(half: Callable[[], None]) -> int:
     return count
 
 
-def _filtered_and_painting() -> None:
-    """The smoother, points in dual return mode and products; then what photographs are laid on."""
+def _filtered_and_images() -> None:
+    """The smoother, points in dual return mode and products; then a block of photographs, and what they are laid on."""
+    from groundproc.imagery.bundle import warmup as bundle
     from groundproc.imagery.painting import warmup as painting
 
     _process(True, ["--method", "filtered"])
+    bundle.warm_up()
     with tempfile.TemporaryDirectory(prefix="swath-warmup-") as folder:
         painting.warm_up(Path(folder))
 
@@ -88,7 +90,7 @@ def _live_and_adjusted() -> None:
     _process(False, [])
 
 
-HALVES = (_filtered_and_painting, _live_and_adjusted)
+HALVES = (_filtered_and_images, _live_and_adjusted)
 """Of about one length, and in an order in which hardly a kernel is compiled by both."""
 
 

@@ -7,6 +7,7 @@ from numba import njit
 from groundproc.imagery import lenses
 from groundproc.imagery.bundle.block import Block
 from groundproc.imagery.bundle.rows import System, ray_of, system_of
+from groundproc.imagery.bundle.schur import inverted
 from groundproc.imagery.bundle.unknowns import Unknowns, lay_out
 
 Array = npt.NDArray[np.float64]
@@ -29,7 +30,8 @@ def _widest(directions: Array) -> float:
 @njit(cache=True, nogil=True)
 def _intersect(system: System, points: Array, angle: Array) -> None:
     ray, mat, away = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
-    origin = np.zeros(3)
+    origin, inside, centre = np.zeros(3), np.zeros(3), np.zeros(3)
+    inverse = np.zeros((3, 3))
     for p in range(len(points)):
         matrix, right = np.zeros((3, 3)), np.zeros(3)
         first, last = system.first[p], system.first[p + 1]
@@ -41,12 +43,13 @@ def _intersect(system: System, points: Array, angle: Array) -> None:
                 continue
             if not lenses.unprojected(system.kind[camera], system.lens[camera], system.pixel[i], ray):
                 continue
-            direction = ray.copy()
+            inside[0], inside[1], inside[2] = ray[0], ray[1], ray[2]
             # with the point at the frame's origin the ray is the origin in the camera frame, and the camera is where it is nothing
             ray_of(system, i, origin, ray, mat, away)
-            centre = -(mat.T @ ray)
-            direction = mat.T @ direction
-            directions[count] = direction
+            for j in range(3):
+                centre[j] = -(mat[0, j] * ray[0] + mat[1, j] * ray[1] + mat[2, j] * ray[2])
+                directions[count, j] = mat[0, j] * inside[0] + mat[1, j] * inside[1] + mat[2, j] * inside[2]
+            direction = directions[count]
             count += 1
             for j in range(3):
                 for k in range(3):
@@ -54,10 +57,11 @@ def _intersect(system: System, points: Array, angle: Array) -> None:
                     matrix[j, k] += share
                     right[j] += share * centre[k]
         angle[p] = _widest(directions[:count])
-        if count < 2 or np.linalg.det(matrix) < 1e-12:
-            points[p] = np.nan
+        if count < 2 or not inverted(matrix, 0.0, inverse):
+            points[p, 0], points[p, 1], points[p, 2] = np.nan, np.nan, np.nan
             continue
-        points[p] = np.linalg.solve(matrix, right)
+        for k in range(3):
+            points[p, k] = inverse[k, 0] * right[0] + inverse[k, 1] * right[1] + inverse[k, 2] * right[2]
 
 
 def intersect(block: Block, unknowns: Unknowns | None = None) -> tuple[Array, Array]:

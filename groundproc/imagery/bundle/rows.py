@@ -107,14 +107,12 @@ def ray_of(system: System, i: int, point: Array, ray: Array, mat: Array, away: A
     camera, station = system.camera[image], system.station[image]
     since = system.shift_s[camera] - system.shift_s[system.lead[station]]
     since += (system.pixel[i, 1] - system.middle_px[camera]) * system.delay_s[camera]
-    turn = np.eye(3)
-    if since != 0.0:
-        _turned(system.rate_rad_s[station], since, turn)
+    turn, local_ins = np.empty((3, 3)), np.empty((3, 3))
+    _turned(system.rate_rad_s[station], since, turn)
+    _times(system.mat_local_ins[station], turn, local_ins)
     inside = np.zeros(3)
     for k in range(3):
         away[k] = point[k] - system.place_m[station, k] - since * system.velocity_m_s[station, k]
-    local_ins = system.mat_local_ins[station] @ turn
-    mat[:] = system.mat_cam_ins[camera] @ local_ins.T
     for k in range(3):
         inside[k] = -system.lever_m[camera, k]
         for j in range(3):
@@ -123,7 +121,18 @@ def ray_of(system: System, i: int, point: Array, ray: Array, mat: Array, away: A
         ray[k] = 0.0
         for j in range(3):
             ray[k] += system.mat_cam_ins[camera, k, j] * inside[j]
+            mat[k, j] = 0.0
+            for n in range(3):
+                mat[k, j] += system.mat_cam_ins[camera, k, n] * local_ins[j, n]
     return float(since)
+
+
+@njit(cache=True, nogil=True)
+def _times(left: Array, right: Array, out: Array) -> None:
+    """Product of two matrices (3, 3), written out: numpy's would take a second to compile for each kernel that calls it."""
+    for j in range(3):
+        for k in range(3):
+            out[j, k] = left[j, 0] * right[0, k] + left[j, 1] * right[1, k] + left[j, 2] * right[2, k]
 
 
 @njit(cache=True, nogil=True)
@@ -181,8 +190,10 @@ def row_of(
     if not lenses.compared(system.kind[camera], system.lens[camera], ray, system.pixel[i], residual, by_ray, by_lens):
         return False
     velocity = system.velocity_m_s[station]
-    turning = system.mat_local_ins[station] @ system.rate_rad_s[station]
-    turned = np.zeros(3)
+    turning, turned = np.zeros(3), np.zeros(3)
+    for j in range(3):
+        for k in range(3):
+            turning[j] += system.mat_local_ins[station, j, k] * system.rate_rad_s[station, k]
     turned[0] = away[1] * turning[2] - away[2] * turning[1]
     turned[1] = away[2] * turning[0] - away[0] * turning[2]
     turned[2] = away[0] * turning[1] - away[1] * turning[0]

@@ -54,23 +54,25 @@ def _column_at(columns: Ints, count: int, column: int) -> int:
 def _new_column(columns: Ints, count: int, column: int, mixed: Array, camera_side: Array) -> int:
     """One more column of a point, empty; how many there are then."""
     columns[count] = column
-    mixed[count] = 0.0
-    camera_side[count, : count + 1] = 0.0
-    camera_side[: count + 1, count] = 0.0
+    for k in range(3):
+        mixed[count, k] = 0.0
+    for k in range(count + 1):
+        camera_side[count, k] = 0.0
+        camera_side[k, count] = 0.0
     camera_side[count, -1] = 0.0
     return count + 1
 
 
 @njit(cache=True, nogil=True)
 def _add_row(
-    value: Array, by_point: Array, residual: float, place: Ints, mixed: Array, own: Array, camera_side: Array
+    value: Array, used: int, by_point: Array, residual: float, place: Ints, mixed: Array, own: Array, camera_side: Array
 ) -> None:
-    """Add the products of one row: `value` (used,) in the columns at `place`, `by_point` (3,)."""
-    for j in range(len(place)):
+    """Add the products of one row: the first `used` of `value` in the columns at `place`, `by_point` (3,)."""
+    for j in range(used):
         at, v = place[j], value[j]
         for k in range(3):
             mixed[at, k] += v * by_point[k]
-        for k in range(len(place)):
+        for k in range(used):
             camera_side[at, place[k]] += v * value[k]
         camera_side[at, -1] += v * residual
     for j in range(3):
@@ -106,7 +108,7 @@ def _known_of_point(
                 place[k] = _column_at(columns, count, system.common_column[k])
                 if place[k] == count:
                     count = _new_column(columns, count, system.common_column[k], mixed, camera_side)
-        _add_row(value[:used], normal, left, place[:used], mixed, own, camera_side)
+        _add_row(value, used, normal, left, place, mixed, own, camera_side)
     return count
 
 
@@ -118,7 +120,9 @@ def _point_system(
 
     `columns` (m,) are the columns of the reduced system that the rows of this point have.
     """
-    own[:] = 0.0
+    for j in range(3):
+        for k in range(4):
+            own[j, k] = 0.0
     count = 0
     residual = np.zeros(2)
     by_pose, by_point, by_camera = np.zeros((2, _POSE)), np.zeros((2, 3)), np.zeros((2, _OF_CAMERA))
@@ -142,7 +146,7 @@ def _point_system(
                 value[a, used] = by_pose[a, j] if j < _POSE else by_camera[a, j - _POSE]
             used += 1
         for a in range(2):
-            _add_row(value[a, :used], by_point[a], residual[a], place[:used], mixed, own, camera_side)
+            _add_row(value[a], used, by_point[a], residual[a], place, mixed, own, camera_side)
     return int(_known_of_point(system, p, point, columns, count, mixed, own, camera_side))
 
 
@@ -154,8 +158,10 @@ def inverted(own: Array, damping: float, out: Array) -> bool:
     m00, m01, m02 = b * c - e * e, f * e - d * c, d * e - f * b
     determinant = a * m00 + d * m01 + f * m02
     scale = max(a, b, c)
-    out[:] = 0.0
     if not determinant > _WEAKEST * scale * scale * scale:
+        for j in range(3):
+            for k in range(3):
+                out[j, k] = 0.0
         return False
     out[0, 0], out[0, 1], out[0, 2] = m00 / determinant, m01 / determinant, m02 / determinant
     out[1, 0], out[1, 1], out[1, 2] = out[0, 1], (a * c - f * f) / determinant, (d * f - a * e) / determinant
@@ -163,32 +169,56 @@ def inverted(own: Array, damping: float, out: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
-def widest(system: System) -> int:
-    """Columns that the rows of one point can have."""
-    most = 0
-    for p in range(len(system.first) - 1):
-        most = max(most, system.first[p + 1] - system.first[p])
-    return int(most * _POSE + np.count_nonzero(system.camera_column >= 0) + np.count_nonzero(system.common_column >= 0))
+def _widest(system: System, columns: int) -> int:
+    """Columns that the rows of one point can have, of all there are."""
+    most = int(np.diff(system.first).max(initial=0)) * _POSE
+    most += int((system.camera_column >= 0).sum() + (system.common_column >= 0).sum())
+    return min(most, columns)
 
 
-@njit(cache=True, nogil=True)
 def reduce(system: System, points: Array, damping: float, matrix: Array, gradient: Array, kept: Eliminated) -> None:
     """Add the rows of all points to the reduced normal matrix (n, n) and its gradient (n,); fill what is kept."""
-    size = min(widest(system), len(gradient))
+    _reduce(system, points, damping, matrix, gradient, kept, _widest(system, len(gradient)))
+
+
+def back(system: System, points: Array, kept: Eliminated, step: Array, out: Array) -> None:
+    """Steps of the points, shape (p, 3), that belong to a step of the reduced system, shape (n,)."""
+    _back(system, points, kept, step, out, _widest(system, len(step)))
+
+
+def point_cofactors(system: System, points: Array, kept: Eliminated, cofactor: Array, out: Array) -> None:
+    """Cofactors of the points, shape (p, 3, 3), from those of the reduced system, shape (n, n): V^-1 + V^-1 W^T Q W V^-1.
+
+    Not a number where a point is not determined.
+    """
+    out[~kept.determined] = np.nan
+    _point_cofactors(system, points, kept, cofactor, out, _widest(system, len(cofactor)))
+
+
+@njit(cache=True, nogil=True)
+def _carry(mixed: Array, inverse: Array, count: int, out: Array) -> None:
+    """W V^-1 of one point, the first `count` rows."""
+    for j in range(count):
+        for k in range(3):
+            out[j, k] = mixed[j, 0] * inverse[0, k] + mixed[j, 1] * inverse[1, k] + mixed[j, 2] * inverse[2, k]
+
+
+@njit(cache=True, nogil=True)
+def _reduce(
+    system: System, points: Array, damping: float, matrix: Array, gradient: Array, kept: Eliminated, size: int
+) -> None:
     columns, mixed = np.empty(size, np.int64), np.empty((size, 3))
     own, camera_side = np.empty((3, 4)), np.empty((size, size + 1))
     carried = np.empty((size, 3))
     for p in range(len(points)):
         count = _point_system(system, p, points[p], columns, mixed, own, camera_side)
         kept.determined[p] = inverted(own, damping, kept.inverse[p])
-        kept.gradient[p] = own[:, 3]
+        for k in range(3):
+            kept.gradient[p, k] = own[k, 3]
         if not kept.determined[p]:
             continue
         inverse = kept.inverse[p]
-        for j in range(count):
-            for k in range(3):
-                carried[j, k] = mixed[j, 0] * inverse[0, k] + mixed[j, 1] * inverse[1, k] + mixed[j, 2] * inverse[2, k]
+        _carry(mixed, inverse, count, carried)
         for j in range(count):
             row = columns[j]
             gradient[row] += camera_side[j, -1] - (
@@ -201,14 +231,13 @@ def reduce(system: System, points: Array, damping: float, matrix: Array, gradien
 
 
 @njit(cache=True, nogil=True)
-def back(system: System, points: Array, kept: Eliminated, step: Array, out: Array) -> None:
-    """Steps of the points, shape (p, 3), that belong to a step of the reduced system, shape (n,)."""
-    size = min(widest(system), len(step))
+def _back(system: System, points: Array, kept: Eliminated, step: Array, out: Array, size: int) -> None:
     columns, mixed = np.empty(size, np.int64), np.empty((size, 3))
     own, camera_side = np.empty((3, 4)), np.empty((size, size + 1))
     right = np.empty(3)
     for p in range(len(points)):
-        out[p] = 0.0
+        for k in range(3):
+            out[p, k] = 0.0
         if not kept.determined[p]:
             continue
         count = _point_system(system, p, points[p], columns, mixed, own, camera_side)
@@ -222,28 +251,32 @@ def back(system: System, points: Array, kept: Eliminated, step: Array, out: Arra
 
 
 @njit(cache=True, nogil=True)
-def point_cofactors(system: System, points: Array, kept: Eliminated, cofactor: Array, out: Array) -> None:
-    """Cofactors of the points, shape (p, 3, 3), from those of the reduced system, shape (n, n): V^-1 + V^-1 W^T Q W V^-1."""
-    size = min(widest(system), len(cofactor))
+def _weigh(cofactor: Array, columns: Ints, count: int, carried: Array, out: Array) -> None:
+    """Sum of the rows of one point, shape (count, 3), by one row of the cofactors."""
+    for a in range(3):
+        out[a] = 0.0
+    for k in range(count):
+        share = cofactor[columns[k]]
+        for a in range(3):
+            out[a] += share * carried[k, a]
+
+
+@njit(cache=True, nogil=True)
+def _point_cofactors(system: System, points: Array, kept: Eliminated, cofactor: Array, out: Array, size: int) -> None:
     columns, mixed = np.empty(size, np.int64), np.empty((size, 3))
     own, camera_side = np.empty((3, 4)), np.empty((size, size + 1))
     carried, moved = np.empty((size, 3)), np.empty(3)
     for p in range(len(points)):
-        out[p] = np.nan
         if not kept.determined[p]:
             continue
         count = _point_system(system, p, points[p], columns, mixed, own, camera_side)
         inverse = kept.inverse[p]
-        out[p] = inverse
+        for a in range(3):
+            for b in range(3):
+                out[p, a, b] = inverse[a, b]
+        _carry(mixed, inverse, count, carried)
         for j in range(count):
-            for k in range(3):
-                carried[j, k] = mixed[j, 0] * inverse[0, k] + mixed[j, 1] * inverse[1, k] + mixed[j, 2] * inverse[2, k]
-        for j in range(count):
-            moved[:] = 0.0
-            for k in range(count):
-                share = cofactor[columns[j], columns[k]]
-                for a in range(3):
-                    moved[a] += share * carried[k, a]
+            _weigh(cofactor[columns[j]], columns, count, carried, moved)
             for a in range(3):
                 for b in range(3):
                     out[p, a, b] += carried[j, a] * moved[b]
