@@ -26,6 +26,9 @@ Array = npt.NDArray[np.float64]
 MOST: Final = 400_000
 """Points of A that are looked at."""
 _SAMPLE: Final = 60_000
+"""Points of B that are laid on A, and fewer from afar."""
+_FAR_SAMPLE: Final = 10_000
+_FAR_M: Final = 0.5
 _STAGES_M: Final = (3.0, 1.5, 0.8, 0.4, 0.4, 0.25, 0.25, 0.25)
 _FEWEST: Final = 200
 _PRIOR: Final = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.02])
@@ -110,14 +113,14 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
     """
     about = np.round(a_m.mean(axis=0))
     a, b = a_m - about, b_m - about
-    surface, other = _smoothed(a, what), _smoothed(b, what)
-    tree: Any = cKDTree(surface.xyz)
-    step = max(1, len(other.xyz) // _SAMPLE)
-    sample = other.xyz[::step]
+    surface, sample = _smoothed(a, what), _smoothed(b, what, _SAMPLE)
+    tree: Any = cKDTree(surface.xyz, balanced_tree=False)
+    few = max(1, len(sample.xyz) // _FAR_SAMPLE)
     matrix, covariance, residual_m = np.eye(4), np.diag(_PRIOR**2), 0.0
     overlap = 0.0
     for number, reach in enumerate(_STAGES_M):
-        moved = sample @ matrix[:3, :3].T + matrix[:3, 3]
+        other = sample.some(slice(None, None, few if reach > _FAR_M else 1))
+        moved = other.xyz @ matrix[:3, :3].T + matrix[:3, 3]
         distance, nearest = tree.query(moved, distance_upper_bound=reach)
         near = np.isfinite(distance)
         if number == 0:
@@ -129,13 +132,12 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
                 )
         if near.sum() < _FEWEST:
             break
-        some = other.some(np.flatnonzero(near) * step)
         settled = number >= len(_STAGES_M) - _SETTLED
-        step_m, covariance, residual_m = _adjust(surface, some, moved[near], nearest[near], matrix, settled)
+        step_m, covariance, residual_m = _adjust(surface, other.some(near), moved[near], nearest[near], matrix, settled)
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = Rotation.from_rotvec(step_m[3:]).as_matrix(), step_m[:3]
         matrix = change @ matrix
-    fit = _fit(surface, tree, sample @ matrix[:3, :3].T + matrix[:3, 3])
+    fit = _fit(surface, tree, sample.xyz @ matrix[:3, :3].T + matrix[:3, 3])
     if fit < _LEAST_FIT:
         raise CoverageError(
             f"{what}: {fit:.0%} of the points next to each other lie on one surface, expected {_LEAST_FIT:.0%} or more: "
@@ -144,16 +146,19 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
     return Registration(_about(matrix, about), about, covariance, residual_m, overlap, fit)
 
 
-def _smoothed(xyz: Array, what: str) -> "_Surface":
-    """Points that lie on surfaces, on them."""
-    planes = normals(xyz)
+def _smoothed(xyz: Array, what: str, most: int | None = None) -> "_Surface":
+    """Points that lie on surfaces, on them: all, or so many at most, of twice as many that are looked at."""
+    looked = slice(None, None, max(1, len(xyz) // (2 * most))) if most else slice(None)
+    planes = normals(xyz, of=looked)
     good = np.isfinite(planes.sigma_rad) & (planes.roughness_m < 0.2)
     if good.sum() < _FEWEST:
         raise CoverageError(
             f"{what}: {int(good.sum())} points on surfaces found, expected {_FEWEST} or more to lay them on each other"
         )
-    on = xyz[good] - planes.off_m[good, None] * planes.normal[good]
-    return _Surface(on, planes.normal[good], planes.roughness_m[good])
+    rows = np.flatnonzero(good)
+    rows = rows[:: max(1, len(rows) // most)] if most else rows
+    on = xyz[looked][rows] - planes.off_m[rows, None] * planes.normal[rows]
+    return _Surface(on, planes.normal[rows], planes.roughness_m[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +167,7 @@ class _Surface:
     normal: Array
     rough: Array
 
-    def some(self, rows: npt.NDArray[Any]) -> "_Surface":
+    def some(self, rows: npt.NDArray[Any] | slice) -> "_Surface":
         """Places and planes of some of its points."""
         return _Surface(self.xyz[rows], self.normal[rows], self.rough[rows])
 

@@ -64,27 +64,34 @@ class _Level(NamedTuple):
     sigma: Array
 
 
-def normals(xyz_m: Array, edges_m: tuple[float, ...] = EDGES_M) -> Normals:
-    """Normals of all points of a piece of a cloud.
+def normals(
+    xyz_m: Array, edges_m: tuple[float, ...] = EDGES_M, of: npt.NDArray[np.int64] | slice = slice(None)
+) -> Normals:
+    """Normals of the points of a piece of a cloud.
 
     Parameters
     ----------
     xyz_m : ndarray, shape (n, 3)
     edges_m : tuple of float
         Edges of the voxels of each level, ascending.
+    of : ndarray of int64, shape (m,), or slice
+        Points whose normals are asked for; all of them make the planes.
 
     Returns
     -------
     Normals
+        Of m points.
     """
     local = np.ascontiguousarray(xyz_m - np.floor(xyz_m.min(axis=0))) if len(xyz_m) else np.empty((0, 3))
-    found = Normals(np.full((len(local), 3), np.nan), *(np.full(len(local), np.nan) for _ in range(3)))
-    limit = np.full(len(local), np.inf)
     levels = [_level(local, edge) for edge in edges_m] if len(local) else []
+    levels = [level._replace(voxel=np.ascontiguousarray(level.voxel[of])) for level in levels]
+    asked = np.ascontiguousarray(local[of])
+    found = Normals(np.full((len(asked), 3), np.nan), *(np.full(len(asked), np.nan) for _ in range(3)))
+    limit = np.full(len(asked), np.inf)
     for level in levels:
-        _limits(local, level, limit)
+        _limits(asked, level, limit)
     for level in levels:
-        _choose(local, level, limit, found)
+        _choose(asked, level, limit, found)
     return found
 
 
