@@ -49,7 +49,8 @@ def motion_about(r: Readings, model: Model, steps: Steps, reference: Reference) 
         step_s=step_s,
         angle_rad=steps.rate * step_s[:, None],
         push_m_s=force * step_s[:, None],
-        steady_m_s=steady * step_s[:, None],
+        # as filters leave it its axes lie the other way round: the kernels would be compiled for that as well
+        steady_m_s=np.ascontiguousarray(steady) * step_s[:, None],
         rate_density=steps.rate_density,
         force_density=steps.force_density,
         gravity_m_s2=r.gravity_m_s2,
