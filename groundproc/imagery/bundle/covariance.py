@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
 
 from flightlog.errors import CoverageError
 from groundproc.imagery.bundle.block import CONTROL, Block
@@ -19,6 +19,11 @@ from groundproc.imagery.site import Site
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+
+_MOSTLY = 0.5
+"""Share of what is not told that makes it a matter of the lens."""
+_MOVES = 0.1
+_NAMED = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,15 +92,35 @@ def cofactors(solved: Solved) -> Cofactors:
     matrix = normal.matrix
     # unknowns of metres and of coefficients of 1e-12 go together: scaled to ones first
     scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    scaled = matrix / scale[:, None] / scale[None, :]
     try:
-        factor = cho_factor(matrix / scale[:, None] / scale[None, :], lower=True)
+        factor = cho_factor(scaled, lower=True)
     except LinAlgError:
-        raise CoverageError(
-            "the block is not determined: images that share too few points with others, or values to estimate that they cannot "
-            "tell; give the rig fewer to estimate or sigmas"
-        ) from None
+        raise CoverageError(f"the block is not determined: {_free(solved, scaled)}") from None
     inverse = cho_solve(factor, np.eye(len(matrix))) / scale[:, None] / scale[None, :]
     return Cofactors((inverse + inverse.T) / 2.0, normal)
+
+
+def _free(solved: Solved, scaled: Array) -> str:
+    """What moves where the normal equations say nothing, in words."""
+    block, unknowns = solved.block, solved.unknowns
+    share = np.append(
+        np.square(eigh(scaled, subset_by_index=[0, 0])[1][:, 0]), 0.0
+    )  # a value that is held has no share
+    own = share[unknowns.camera]
+    if own.sum() > _MOSTLY:
+        camera, place = np.unravel_index(int(own.argmax()), own.shape)
+        name = (*lens_names(block, int(camera)), *MOUNTING)[place]
+        return f"nothing tells {name} of {block.rig.cameras[camera].name}; leave it out of the rig's estimate, or give it a sigma"
+    station = share[unknowns.station].sum(axis=1)
+    moves = (station > _MOVES * station.max())[block.station]
+    some = moves if 2 * np.count_nonzero(moves) <= len(moves) else ~moves
+    names = [name for name, one in zip(block.images, some, strict=True) if one]
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return (
+        f"{', '.join(names[:_NAMED])}{more} and the others are not held together, as where too few points are in common or all were taken "
+        "from one place; leave them out, or give places"
+    )
 
 
 def balance(solved: Solved, found: Cofactors) -> Balance:
