@@ -11,6 +11,7 @@ from flightlog.errors import CaptureError, UsageError
 from groundproc.imagery import assembly, clockoffset, flown, gate, hybrid, lasting, located, results
 from groundproc.imagery.assembly import Assembled, Known
 from groundproc.imagery.bundle.block import Block
+from groundproc.imagery.bundle.covariance import LooseError
 from groundproc.imagery.bundle.screen import Adjusted, adjust
 from groundproc.imagery.lensdoubt import lens_doubts
 from groundproc.imagery.measurements import Measurements, Tracks, gather, rows_of
@@ -30,6 +31,8 @@ _SETTLED_S: Final = 5e-5
 """Shifts of clocks that change less than this need no new poses of the trajectory."""
 _MOST_ROUNDS: Final = 5
 _MOST_RMS_PX: Final = 3.0
+_FEWEST_IMAGES: Final = 3
+"""What is left of a block has to be one."""
 _FEW_POINTS: Final = 6
 """An image with fewer is hardly placed by them."""
 
@@ -51,14 +54,33 @@ def run(task: Task, progress: Progress) -> dict[str, Any]:
     known, measured = _measured(task, session, known, surface, seen, progress)
     if _set_clocks(session, measured):
         known, measured = _measured(task, session, known_of(session), surface, seen, progress)
+    adjusted, told = _made(session, known, measured, surface, progress)
+    return _finish(task, session, adjusted, measured, told)
+
+
+def _made(
+    session: Session, known: Known, measured: Measurements, surface: Surface | None, progress: Progress
+) -> tuple[Adjusted, dict[str, Any]]:
+    """Assembled and adjusted; images that nothing holds to the others are left out, and the rest goes on."""
     made = assembly.assemble(
         session.rig, session.names, session.camera, known, measured, session.site, session.control, ()
     )
     for name in made.unplaced:
-        session.left_out[name] = "too few points in common with the others"
+        session.left_out.setdefault(name, "too few points in common with the others")
+    try:
+        found = _adjusted(session, made, measured, surface, progress)
+    except LooseError as error:
+        if len(made.block.images) - len(error.images) < _FEWEST_IMAGES:
+            raise
+        session.left_out |= dict.fromkeys(
+            error.images, "nothing holds it to the others: too few points, or all from one place"
+        )
+        loose = np.isin(session.names, error.images)
+        held = ~loose[measured.points.image]
+        rest = replace(measured, points=measured.points.masked(held), matched=measured.matched[held])
+        return _made(session, replace(known, posed=known.posed & ~loose), rest, surface, progress)
     session.warnings += made.notes
-    adjusted, told = _adjusted(session, made, measured, surface, progress)
-    return _finish(task, session, adjusted, measured, told)
+    return found
 
 
 def _measured(

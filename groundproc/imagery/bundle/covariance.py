@@ -26,6 +26,18 @@ _MOVES = 0.1
 _NAMED = 5
 
 
+class LooseError(CoverageError):
+    """Images that nothing holds to the others, the fewer of both."""
+
+    def __init__(self, images: tuple[str, ...]) -> None:
+        more = f" and {len(images) - _NAMED} more" if len(images) > _NAMED else ""
+        super().__init__(
+            f"the block is not determined: {', '.join(images[:_NAMED])}{more} and the others are not held together, as where too few "
+            "points are in common or all were taken from one place; leave them out, or give places"
+        )
+        self.images = images
+
+
 @dataclass(frozen=True, slots=True)
 class Balance:
     """Observations against unknowns.
@@ -96,13 +108,13 @@ def cofactors(solved: Solved) -> Cofactors:
     try:
         factor = cho_factor(scaled, lower=True)
     except LinAlgError:
-        raise CoverageError(f"the block is not determined: {_free(solved, scaled)}") from None
+        raise _undetermined(solved, scaled) from None
     inverse = cho_solve(factor, np.eye(len(matrix))) / scale[:, None] / scale[None, :]
     return Cofactors((inverse + inverse.T) / 2.0, normal)
 
 
-def _free(solved: Solved, scaled: Array) -> str:
-    """What moves where the normal equations say nothing, in words."""
+def _undetermined(solved: Solved, scaled: Array) -> CoverageError:
+    """What moves where the normal equations say nothing."""
     block, unknowns = solved.block, solved.unknowns
     share = np.append(
         np.square(eigh(scaled, subset_by_index=[0, 0])[1][:, 0]), 0.0
@@ -111,16 +123,14 @@ def _free(solved: Solved, scaled: Array) -> str:
     if own.sum() > _MOSTLY:
         camera, place = np.unravel_index(int(own.argmax()), own.shape)
         name = (*lens_names(block, int(camera)), *MOUNTING)[place]
-        return f"nothing tells {name} of {block.rig.cameras[camera].name}; leave it out of the rig's estimate, or give it a sigma"
+        return CoverageError(
+            f"the block is not determined: nothing tells {name} of {block.rig.cameras[camera].name}; leave it out of the rig's estimate, "
+            "or give it a sigma"
+        )
     station = share[unknowns.station].sum(axis=1)
     moves = (station > _MOVES * station.max())[block.station]
     some = moves if 2 * np.count_nonzero(moves) <= len(moves) else ~moves
-    names = [name for name, one in zip(block.images, some, strict=True) if one]
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return (
-        f"{', '.join(names[:_NAMED])}{more} and the others are not held together, as where too few points are in common or all were taken "
-        "from one place; leave them out, or give places"
-    )
+    return LooseError(tuple(name for name, one in zip(block.images, some, strict=True) if one))
 
 
 def balance(solved: Solved, found: Cofactors) -> Balance:

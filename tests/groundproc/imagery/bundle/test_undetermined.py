@@ -1,15 +1,20 @@
 """A block that falls apart is refused with the names of what is loose."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from flightlog.errors import CoverageError
+from groundproc.cli import main
 from groundproc.imagery.bundle.block import Block, Stations, image_points
 from groundproc.imagery.bundle.covariance import cofactors
 from groundproc.imagery.bundle.solve import Solved
 from groundproc.imagery.bundle.unknowns import lay_out
 from groundproc.imagery.camera import Camera
-from groundproc.imagery.rig import Rig, RigCamera
+from groundproc.imagery.poses import NO_TIME, ImagePoses, write_poses
+from groundproc.imagery.rig import Rig, RigCamera, write_rig
 from groundproc.imagery.rotations import STRAIGHT_DOWN
 
 MIDDLE_PX = (319.5, 239.5)
@@ -64,3 +69,33 @@ def test_a_value_of_the_lens_that_nothing_tells_is_named() -> None:
     told = refused(block_of(place_m, [([0, 1, 2], flat)], ("f", "aspect")))
     assert "nothing tells" in told
     assert "of camera; leave it out of the rig's estimate" in told
+
+
+def test_images_that_nothing_holds_are_left_out_and_the_rest_goes_on(tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    place_m = np.array([[0.0, 0, 20], [3, 0.5, 21], [40, 0, 20], [43, 1, 19], [46, 0, 20], [44, 3, 20]])
+    block = block_of(place_m, [([0, 1], ground(rng, 0.0)), ([2, 3, 4, 5], ground(rng, 42.0))])
+    corner = np.array([500_000.0, 5_500_000.0, 100.0])
+    unknown = np.full((6, 3), np.nan)
+    stamps = np.full(6, NO_TIME)
+    write_poses(
+        tmp_path / "start.csv", ImagePoses(block.images, stamps, place_m + corner, np.zeros((6, 3)), unknown, unknown)
+    )
+    write_rig(tmp_path / "rig.yaml", block.rig)
+    shown = block.measured.pixel + rng.normal(0.0, 0.3, block.measured.pixel.shape)
+    rows = [
+        f"{block.images[image]},p{point},{x:.3f},{y:.3f},0.3"
+        for image, point, (x, y) in zip(block.measured.image, block.measured.point, shown, strict=True)
+    ]
+    (tmp_path / "points.csv").write_text("\n".join(["image,point,x_px,y_px,sigma", *rows]))
+    words = [
+        f"--{key}={tmp_path / file}"
+        for key, file in (("image-points", "points.csv"), ("rig", "rig.yaml"), ("start", "start.csv"))
+    ]
+    assert main(["images", *words, "--crs", "EPSG:32633", "-o", str(tmp_path / "out")]) == 3
+    told = json.loads((tmp_path / "out" / "bundle.json").read_text())
+    assert told["left_out"] == dict.fromkeys(
+        ("0.jpg", "1.jpg"), "nothing holds it to the others: too few points, or all from one place"
+    )
+    assert told["counts"]["images"] == 4
+    assert 0.7 < told["sigma0"] < 1.3
