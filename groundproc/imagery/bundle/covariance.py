@@ -130,6 +130,11 @@ def _undetermined(solved: Solved, scaled: Array) -> CoverageError:
     station = share[unknowns.station].sum(axis=1)
     moves = (station > _MOVES * station.max())[block.station]
     some = moves if 2 * np.count_nonzero(moves) <= len(moves) else ~moves
+    if not some.any():
+        return CoverageError(
+            "the block is not determined: all of it can be moved or turned as one; expected positions or control points that are not on "
+            "one line"
+        )
     return LooseError(tuple(name for name, one in zip(block.images, some, strict=True) if one))
 
 

@@ -9,9 +9,9 @@ import pytest
 from flightlog.errors import CoverageError
 from groundproc.cli import main
 from groundproc.imagery.bundle.block import Block, Stations, image_points
-from groundproc.imagery.bundle.covariance import cofactors
+from groundproc.imagery.bundle.covariance import LooseError, _undetermined, cofactors
 from groundproc.imagery.bundle.solve import Solved
-from groundproc.imagery.bundle.unknowns import lay_out
+from groundproc.imagery.bundle.unknowns import OF_CAMERA, Unknowns, lay_out
 from groundproc.imagery.camera import Camera
 from groundproc.imagery.poses import NO_TIME, ImagePoses, write_poses
 from groundproc.imagery.rig import Rig, RigCamera, write_rig
@@ -99,3 +99,14 @@ def test_images_that_nothing_holds_are_left_out_and_the_rest_goes_on(tmp_path: P
     )
     assert told["counts"]["images"] == 4
     assert 0.7 < told["sigma0"] < 1.3
+
+
+def test_a_block_that_moves_as_one_names_no_image() -> None:
+    """Else it would be tried again without any image less, for ever."""
+    place_m = np.array([[0.0, 0, 20], [3, 0.5, 21], [6, 0, 20]])
+    block = block_of(place_m, [([0, 1, 2], ground(np.random.default_rng(7), 2.0))])
+    every = Unknowns(np.arange(18).reshape(3, 6), np.full((1, OF_CAMERA), -1), 18, "observed")
+    solved = Solved(block, every, block.rig.cameras, 0.0, 0, True)
+    found = _undetermined(solved, np.eye(18) - np.full((18, 18), 1.0 / 18.0))
+    assert not isinstance(found, LooseError)
+    assert "all of it can be moved" in str(found)
