@@ -102,7 +102,8 @@ def _longest(time_s: Array, off_m: Array, steps: Steps) -> Mask:
 
     def strain(i: int, before: Ints) -> Array:
         """Square of the step to i from others, in units of the gate, shape (b,): no more than 1 is explained; 0 where there is none."""
-        share = np.square(off_m[i] - off_m[before]) / (gate2 * steps.variance(time_s, i, before))
+        there = np.maximum(before, 0)
+        share = np.square(off_m[i] - off_m[there]) / (gate2 * steps.variance(time_s, i, there))
         share = np.where((share > 1.0).any(axis=1), np.inf, share.sum(axis=1))
         return np.asarray(np.where(before < 0, 0.0, share))
 
