@@ -1,9 +1,10 @@
-"""Attitude of a kit that has none: gyros, accelerometers and positions alone, over the whole of a piece of flight.
+"""Attitude of a kit that states none, from gyros, accelerometers and positions over a whole piece of flight.
 
-The gyros give the attitude up to one rotation, that of the piece's start, and their bias; turned by it, the accelerometers must give what
-the positions say of the acceleration, gravity included. Second differences of positions are compared with the force weighed by a
-triangle, so that no velocity and no start is needed. Source: Wu and Pan, *Velocity/position integration formula*, IEEE Trans. AES 49
-(2013), in its position form; Wahba's problem by the singular value decomposition. Heading needs a flight that turns or speeds up.
+The gyros give the attitude up to two unknowns: the rotation at the start of the piece, and their bias. Turned by this
+attitude, the accelerometers must agree with the acceleration of the positions, gravity included. Second differences of
+positions are compared with the force weighted by a triangle, so that neither a velocity nor a starting point is
+needed. Source: Wu and Pan, *Velocity/position integration formula*, IEEE Trans. AES 49 (2013), in its position form;
+Wahba's problem by the singular value decomposition. The heading needs a flight that turns or speeds up.
 """
 
 from typing import Final

@@ -1,10 +1,11 @@
-"""Fixes that walk away and come back, told by something that knows how the vehicle moved between them.
+"""Fixes that drift away and come back, found by a witness that knows how the vehicle moved between them.
 
-A witness (the lidar's way, a stated velocity) says what lies between two fixes; what their difference has beyond that is the change of the
-fixes' own error, and of the witness's. Both change slowly: of errors that last a minute, little is new from one second to the next. The
-longest chain of seconds whose steps are all explained so is right, be it interrupted; the rest walked away. A step is looked at over one
-second, and from some seconds and many seconds before, for a slow walk hides in small steps. A second that only strained steps reach is
-worth less than none.
+A witness (the lidar's path, a stated velocity) says what lies between two fixes. The rest of their difference is the
+change of the fixes' own error, and of the witness's. Both change slowly: of errors that last a minute, little is new
+from one second to the next. The longest chain of seconds whose steps are all explained in this way is right, even if
+it is interrupted; the other seconds drifted away. Steps are examined over one second, and also from some and from many
+seconds before, because a slow drift hides in small steps. A second that can be reached only by strained steps counts
+against its chain.
 """
 
 from dataclasses import dataclass

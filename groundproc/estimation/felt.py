@@ -1,4 +1,4 @@
-"""How an autopilot's accelerometers say that the velocity changed: a witness of positions and of the velocities beside them."""
+"""Changes of velocity by an autopilot's accelerometers: a witness for positions and their velocities."""
 
 from dataclasses import dataclass
 from typing import Final

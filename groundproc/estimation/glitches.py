@@ -1,9 +1,9 @@
-"""Positions that jump away and come back: a receiver's glitch, told from a shift that lasts.
+"""Positions that jump away and come back: a receiver's glitch, as opposed to a shift that lasts.
 
-An innovation gate over the whole flight at once. Between two fixes the vehicle moves by its velocity; what a step has beyond that
-is a jump, and the sum of the jumps so far is the level of a fix. The fixes of the level that most of them share are right. Others
-are a glitch where the positions come back to that level, or where they stand alone for a few seconds at either end. A shift that
-lasts and is never taken back is kept, because nothing contradicts it.
+This is an innovation gate over the whole flight at once. Between two fixes the vehicle moves by its velocity. The rest
+of a step is a jump, and the sum of the jumps so far is the level of a fix. The fixes of the level that most of them
+share are right. Others are a glitch if the positions come back to that level, or if they stand alone for a few seconds
+at either end of the flight. A shift that lasts and is never taken back is kept, because nothing contradicts it.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""What the tie of lidar and autopilot leaves open, in the sigma of every pose: a pose that is late by dt is off by speed times dt."""
+"""The uncertain tie of lidar and autopilot in the sigma of every pose: late by dt is off by speed x dt."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,8 +1,7 @@
 """Method `adjusted`: the whole flight in one adjustment of lidar, inertial sensors, GNSS and compass.
 
-packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass; and the sigma of each. And the packets
-once more
---fine--> the motion between the knots.
+packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, biases, compass, and the sigma of each
+packets, once more --fine--> the motion between the knots
 """
 
 import functools

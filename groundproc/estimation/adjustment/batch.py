@@ -1,4 +1,4 @@
-"""The batch: Gauss-Newton over a stretch of the flight, coarse voxels first, with all that is common to it."""
+"""The batch: Gauss-Newton steps over a stretch of the flight and the parameters of the whole, coarse voxels first."""
 
 import functools
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Stretches in which the lidar does not hold the path, bridged by the motion that the smoother has between their good ends."""
+"""Bridging: where the lidar does not hold the path, the smoother's motion joins the good poses at both ends."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

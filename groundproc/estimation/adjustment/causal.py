@@ -1,4 +1,7 @@
-"""The odometry alone as an estimate: nothing of the future is used, but that its first seconds are stated once there is a map."""
+"""The odometry alone as an estimate.
+
+Nothing of the future is used, with one exception: the first seconds are stated only once there is a map.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

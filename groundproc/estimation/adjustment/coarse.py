@@ -1,10 +1,11 @@
-"""The adjustment on a coarse path: the slow bends of a path that its planes follow, which the fine preconditioner does not know.
+"""The adjustment on a coarse path: the slow bends, which the fine preconditioner does not know.
 
-A bend over seconds moves path and planes together, so the lidar hardly holds it; a preconditioner that takes the planes for fixed holds
-it firmly. Conjugate gradients then need hundreds of steps, and where they stop early the bends are missing from the solution and from
-every draw of the posterior. So the same least-squares problem is also solved exactly (Galerkin) for paths that move as rigid bodies
-at nodes some seconds apart, straight between them, and both solutions are added: a two-level additive Schwarz preconditioner whose coarse
-space holds the rigid motions, as that of smoothed aggregation does (Vanek, Mandel, Brezina 1996).
+A bend over seconds moves path and planes together, so the lidar hardly resists it. A preconditioner that takes the
+planes for fixed makes it stiff. Conjugate gradients then need hundreds of steps; if they stop early, the bends are
+missing from the solution and from every draw of the posterior. So the same least-squares problem is also solved
+exactly (Galerkin) for paths that move as rigid bodies at nodes some seconds apart, linearly in between. Both solutions
+are added: a two-level additive Schwarz preconditioner whose coarse space contains the rigid motions, as that of
+smoothed aggregation does (Vanek, Mandel, Brezina 1996).
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,15 @@
-"""The motion between the knots, once the path is right: turns every 5 ms from all that the lidar sees, held by the carrying gyro.
+"""The motion between the knots: rotations every 5 ms from all that the lidar sees, constrained by the carrying gyro.
 
-Between two knots of the batch, a tenth of a second apart, the path has the gyro's motion with the gyro's noise: white, and vibration
-faster than it is read, which aliases. The batch uses a part of the lidar's clusters and cannot follow that. Here the flight is streamed
-once more, some seconds at a time. All clusters of these make a map of planes where the path places them; what each is off its plane then
-tells of the turn at its moment. With the gyro's noise that is a chain of unknowns, each tied to the next, and one banded system.
+Between two knots of the batch, a tenth of a second apart, the path has the gyro's motion with the gyro's noise. That
+noise is white, plus vibration faster than the sampling, which aliases. The batch uses a part of the lidar's clusters
+and cannot follow it. Here the flight is streamed once more, some seconds at a time, once the path is right. All
+clusters of these seconds make a map of planes, placed by the path. The distance of each cluster from its plane then
+tells of the rotation at its moment. With the gyro's noise this is a chain of unknowns, each tied to the next: one
+banded system.
 
-The path's slow part is the batch's and stays: errors are taken to be those of a gyro that something brings back within a tenth of a second
-(Ornstein and Uhlenbeck). Where the lidar sees nothing the path stays as it is. Positions are not touched.
+The slow part of the path is the batch's and stays. Errors are taken to be those of a gyro that something brings back
+within a tenth of a second (an Ornstein-Uhlenbeck process). Where the lidar sees nothing, the path stays as it is.
+Positions are not changed.
 """
 
 import contextlib

@@ -1,11 +1,12 @@
 """The windows of a long flight adjusted together: one more batch, of the whole flight, whose path bends slowly.
 
-Each window has been adjusted by itself, and its path is right within the window. What is left are slow errors: how the windows lie to
-each other, how each is bent over minutes, and how the whole lies on the earth. So the joined path is corrected by a spline with a knot
-every two seconds. It is held by the windows' own shape (as a random walk whose steps are those of the windows' posteriors), by gravity,
-by all positions and attitudes of the flight, and by patches of planes that more than one window saw, each plane solved for within, as
-in a window: streets flown again after ten minutes close like those of the same minute (hierarchical bundle adjustment; Liu et al.
-2023, in its idea). An hour has some 11 000 unknowns and a million patches: less than a window.
+Each window has been adjusted by itself, and its path is right within the window. What is left are slow errors: how the
+windows lie relative to each other, how each is bent over minutes, and how the whole lies on the Earth. The joined path
+is therefore corrected by a spline with a knot every two seconds. Four things hold it: the windows' own shape (a random
+walk whose steps are those of the windows' posteriors); gravity; all positions and attitudes of the flight; and patches
+of planes that more than one window saw, each plane solved for within, as in a window. Streets flown again after ten
+minutes thus close like those of the same minute (the idea of hierarchical bundle adjustment, Liu et al. 2023). An hour
+has some 11 000 unknowns and a million patches: less than a window.
 """
 
 import operator

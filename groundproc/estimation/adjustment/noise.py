@@ -1,9 +1,10 @@
-"""Where the errors of a solution come from, as they are and not as they are weighed: the middle of the sandwich N^-1 (S S^T) N^-1.
+"""Where the errors of a solution come from: the middle of the sandwich N^-1 (S S^T) N^-1.
 
-The weights of the normal matrix N are those of independent rows. Errors are not: what a plane is not, or an edge, is in all rows of
-its voxel and of its neighbours; what the gyro's noise does between two knots is in all returns of that moment, and no spline follows it;
-what the model of a unit lacks lasts for seconds. `Noise` is S: it turns independent numbers of size one, several for each source, into
-what that source does to the gradient.
+The normal matrix N weighs rows as if they were independent, but their errors are not. Where a surface is no plane, or
+has an edge, the error is in all rows of its voxel and of its neighbours. The gyro's noise between two knots is in all
+returns of that moment, and no spline follows it. What the model of an inertial unit lacks lasts for seconds. `Noise`
+is S: it turns independent numbers of size one, several for each source, into the effect of that source on the
+gradient.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a window saw, small: its clusters of five seconds merged into patches of planes, for the joining of windows."""
+"""What a window saw, in little memory: its clusters of five seconds merged into patches, for the joining."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

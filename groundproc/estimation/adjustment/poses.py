@@ -1,4 +1,4 @@
-"""Errors of the adjusted poses: sigmas of position and of roll, pitch, heading, and how the six go together."""
+"""Errors of the adjusted poses: sigmas of position and of roll, pitch and heading, and the correlation of the six."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

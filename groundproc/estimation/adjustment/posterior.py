@@ -1,4 +1,4 @@
-"""What a solution knows of itself: draws of its error, and covariances of what hangs on its unknowns."""
+"""What a solution knows of itself: draws of its error, and covariances of quantities that depend on its unknowns."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
-"""Whether what an adjustment began from refutes it: a lidar that is confidently wrong, where nothing within the adjustment says so.
+"""Whether the starting trajectory refutes an adjustment: a lidar may be wrong with confidence.
 
-Two paths of one flight are compared by what both state and what the same fixes say of either. It takes three things to call the adjusted
-one wrong. It slides away from the fixes that it believes. The smoother's does not. And the two move apart by more than both of them know
-of their motion: of a receiver that errs within seconds, beside walls, the smoother follows hardly more than it states.
+Two paths of one flight are compared, by what both state and by what the same fixes say of either. Three conditions
+must hold before the adjusted path is called wrong. It slides away from the fixes that it believes. The smoother's path
+does not. And the two move apart by more than both know of their motion. Beside walls, where a receiver errs within
+seconds, the smoother follows it by hardly more than it states.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The adjustment of one run of the lidar's clock, once it is done: path, mount, lasers, covariance, self-check and report."""
+"""The finished adjustment of one run of the lidar's clock: path, mount, lasers, covariance, self-check and report."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final

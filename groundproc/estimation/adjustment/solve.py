@@ -1,4 +1,8 @@
-"""Gauss-Newton steps of the adjustment: conjugate gradients on the lidar's implicit normal matrix plus everybody else's sparse one."""
+"""Gauss-Newton steps of the adjustment.
+
+Conjugate gradients solve the sum of two normal matrices: the lidar's, which is only applied, and the sparse one of all
+other observations.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
-"""Windows of a long flight: each a batch of its own, tied to the one before where they overlap, and joined into one path.
+"""Windows of a long flight: each a batch of its own, tied to the one before and joined into one path.
 
-What is left between them after that is for `joining`.
+The errors that are then left between windows are for `joining`.
 """
 
 import operator

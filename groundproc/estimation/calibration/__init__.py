@@ -1,1 +1,1 @@
-"""What several flights tell together: the mount, the lasers, the compass curve."""
+"""What several flights determine together: the mount, the lasers, the compass curve."""

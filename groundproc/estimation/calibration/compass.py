@@ -1,8 +1,9 @@
-"""The compass model: yaw trim as a smooth function of the compass' heading, learnt from several runs, to begin later runs with.
+"""The compass model: yaw trim as a smooth function of the compass heading, learnt from several runs for later ones.
 
-Source: FOI-R--4045--SE (2014) plots yaw trims over heading for seven runs and takes a curve through them. Here the curve is a constant
-and some harmonics: iron that turns with the compass gives one period in a turn, iron that is magnetised by the Earth two (as in the
-compensation of ships' compasses). Its covariance comes from the scatter of runs and headings.
+Source: FOI-R--4045--SE (2014) plots yaw trims over heading for seven runs and takes a curve through them. Here the
+curve is a constant and some harmonics. Iron that turns with the compass gives one period in a turn, iron that is
+magnetised by the Earth two (as in the compensation of ships' compasses). The covariance comes from the scatter of runs
+and headings.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
-"""Mount, clock offset and compass from several flights together, with what each flight says of them and how well they agree.
+"""Mount, clock offset and compass from several flights together, with the result of each flight and their agreement.
 
-Every flight is adjusted on its own; of the parameters that belong to the airframe its normal equations are joined, the nominal values
-counted once. What the flights could not tell stays as it was.
+Every flight is adjusted on its own. The normal equations of the parameters that belong to the airframe are combined,
+with the nominal values counted once. What the flights could not determine stays as it was.
 """
 
 from collections.abc import Mapping, Sequence

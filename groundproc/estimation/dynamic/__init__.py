@@ -1,4 +1,4 @@
-"""Calibration in flight: the source's dynamic calibration (method `dynamic`), and the compass model that is learnt from it.
+"""Calibration in flight: the source's dynamic calibration (method `dynamic`), and the compass model learnt from it.
 
 options       every number of it
 revolutions   the flight cut into turns of the scanner, deskewed, ready to be placed again under trims

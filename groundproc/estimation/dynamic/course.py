@@ -1,7 +1,7 @@
-"""Course over ground: where the vehicle went, by its positions; the witness of yaw trims, as in the source.
+"""Course over ground, by the positions of the vehicle; the witness of yaw trims, as in the source.
 
-A vehicle that drives where it points has a course equal to its heading; the course less the compass' heading is then what the yaw trim
-ought to be. A multirotor flies sideways as well as ahead: there the comparison says how it flew, and is no witness.
+If a vehicle drives where it points, its course equals its heading, and the course minus the compass heading is what
+the yaw trim should be. A multirotor also flies sideways. For it, the comparison says how it flew, and is no witness.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,10 +1,12 @@
-"""Ground models: a raster of heights under one or some revolutions of the scanner, and what two of them differ by.
+"""Ground models: a raster of heights under one or some revolutions of the scanner, and the difference of two of them.
 
-Source: FOI-R--4045--SE (2014), dynamic calibration: points higher than 0.7 m above the ground are dropped, a 5 cm raster, empty pixels
-filled by interpolation over at most 3 pixels, RMSE over the pixels that both models have. What the source leaves open is chosen here:
-a pixel has the mean height of its points; a gap is filled linearly along its row and its column, and by the mean where both reach over it.
+Source: FOI-R--4045--SE (2014), dynamic calibration: points higher than 0.7 m above the ground are dropped, a 5 cm
+raster, empty pixels filled by interpolation over at most 3 pixels, RMSE over the pixels that both models have. What
+the source leaves open is chosen here: a pixel has the mean height of its points; a gap is filled linearly along its
+row and its column, and by the mean of the two where both reach over it.
 
-A raster is dense, so that a pixel is one look, and is cleared pixel by pixel, so that its size costs memory and no time.
+A raster is dense, so that a pixel is a single look-up. It is cleared pixel by pixel, so that its size costs memory but
+no time.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,8 @@
-"""What stands upright, seen from above: how far points of it are from what the reference has of it.
+"""What stands upright, seen from above: the distance of its points from those of the reference.
 
-A ground model says little of a facade: of a wall 30 m away a single laser line lies within 0.7 m of the ground. In plan all of its
-points are one line, whichever lasers hit it, so that rings of the scanner, which move with the aircraft, leave no pattern to lock on.
+A ground model says little about a facade: on a wall 30 m away, a single laser line lies within 0.7 m of the ground. In
+plan, all points of the wall lie on one line, whichever lasers hit it. The rings of the scanner, which move with the
+aircraft, thus leave no pattern that the search could lock on to.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,10 @@
-"""The autopilot's gyros and accelerometers and the lidar's, made into one IMU on one grid of time.
+"""The gyros and accelerometers of autopilot and lidar, made into one IMU on one grid of time.
 
-The autopilot's sensors are the better ones, but a slow link sends few of their samples, with stamps that jitter; the lidar's come 200
-times a second. So the lidar's readings are brought to the autopilot's by a matrix and an offset that a least-squares fit finds (which takes
-in mount, scale, misalignment and a sensor of the wrong sign), follow the fast motion, and are pulled at low frequency towards the
-autopilot's: by the share that leaves the least noise, which the difference of the two tells (Wiener).
+The autopilot's sensors are better, but a slow link sends few of their samples, with stamps that jitter. The lidar's
+come 200 times a second. A least-squares fit finds the matrix and the offset that bring the lidar's readings to the
+autopilot's (mount, scale, misalignment and a sensor of the wrong sign included). The combination follows the lidar's
+readings in fast motion. At low frequency it is pulled towards the autopilot's by the share that leaves the least
+noise, which follows from the difference of the two (Wiener).
 """
 
 from dataclasses import dataclass

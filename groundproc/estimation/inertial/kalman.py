@@ -1,12 +1,13 @@
 """Kalman filter and backward smoother over a whole flight, about a reference: one Gauss-Newton step.
 
-The reference need not obey the equations of motion. What it misses them by is a known input of the filter, so that the step ends at the
-optimum of the linearised problem wherever it began. The smoother is that of Durbin and Koopman (2012, 4.4; Bryson and Frazier 1963): it
-carries an adjoint back instead of inverting covariances, which costs no more than the filter itself and keeps the covariance's rank.
-Measurements are taken one scalar after the other.
+The reference need not obey the equations of motion. The amount by which it violates them is a known input of the
+filter, so that the step ends at the optimum of the linearised problem wherever it began. The smoother is that of
+Durbin and Koopman (2012, 4.4; Bryson and Frazier 1963). It carries an adjoint back instead of inverting covariances,
+which costs no more than the filter itself and also works if a covariance is singular. Measurements are taken one
+scalar after the other.
 
-The filter runs twice: the first time it keeps its state at the start of each block only, the second time all of one block, which the
-smoother then walks back over. An hour at 200 nodes a second needs 18 MB for that.
+The filter runs twice. The first time it keeps its state only at the start of each block; the second time it keeps all
+of one block, over which the smoother then runs back. An hour at 200 nodes a second needs 18 MB for that.
 """
 
 from typing import Final, NamedTuple

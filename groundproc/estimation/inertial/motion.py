@@ -1,4 +1,4 @@
-"""What moves the smoother's states from node to node about a reference, and where they start."""
+"""How the smoother's states propagate from node to node about a reference, and their values at the start."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""What the smoother linearises about: rates and forces of each step, and the path that they and the autopilot begin with."""
+"""The reference of the linearisation: rates and forces of each step, and the path that the iteration begins with."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -1,4 +1,4 @@
-"""The estimate: linearise about a reference, smooth, learn the noise from what is left, and again."""
+"""The estimate: linearise about a reference, smooth, learn the noise from the residuals, and repeat."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

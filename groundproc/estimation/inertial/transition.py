@@ -1,4 +1,7 @@
-"""Transition of the states from node to node, and by how much the reference misses it: for the filter and, transposed, the smoother."""
+"""Transition of the states from node to node, and the amount by which the reference violates it.
+
+The filter uses it as it is, the smoother transposed.
+"""
 
 from typing import NamedTuple
 

@@ -1,9 +1,10 @@
-"""Where the map as a whole has to go for its surfaces to meet the control: a search as wide as the map may be off, then six unknowns.
+"""Where the map as a whole has to go for its surfaces to meet the control: a wide search, then six unknowns.
 
-A map that hangs on GNSS is metres and a degree off, and a place on a wall does not say which wall. All shifts and turns within three
-sigma are tried against the patches of the map; the best of them are refined, and the one that explains most is kept. A point counts
-only where others foretell which surface it lies on: alone it would find a wall somewhere. What contradicts the rest is blundered, one
-point after the other (Baarda's data snooping).
+A map that depends on GNSS is off by metres and a degree, and a place on a wall does not say which wall. All shifts and
+turns within three sigma are tried against the patches of the map; the best of them are refined, and the one that
+explains most points is kept. A point counts only where others predict which surface it lies on, because alone it would
+find a wall somewhere. A point that contradicts the rest is left out as a blunder, one after the other (Baarda's data
+snooping).
 """
 
 from collections.abc import Sequence

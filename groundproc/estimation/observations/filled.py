@@ -1,7 +1,7 @@
-"""What fills its voxel instead of lying on a plane: leaves, tufts, hedges, crops, as rows of the adjustment.
+"""What fills its voxel instead of lying on a plane (leaves, tufts, hedges, crops), as rows of the adjustment.
 
-Such a voxel gives three rows a cluster, one along each axis of its spread, as it does in the odometry (`matching`). The mean along each
-axis is solved for within, as a plane's offset is: these are rows of planes without tilts.
+Such a voxel gives three rows for each cluster, one along each axis of its scatter, as in the odometry (`matching`).
+The mean along each axis is solved for within, as a plane's offset is: these are rows of planes without tilts.
 """
 
 from typing import Final, NamedTuple

@@ -1,9 +1,9 @@
 """A map held to control points and planes: one row for each place that its surface has to go through.
 
-A point on a surface does not fix a point of the cloud, only the surface's distance along its normal. That surface is a plane through
-clusters of many slices, solved for within: distance = survey - sum of shares x clusters, with the variance of both. This is what is
-left when the plane is taken out of the unknowns. Such a row touches all slices that saw the place; it is applied as it is and stands in
-no sparse matrix.
+A point on a surface does not fix a point of the cloud, only the distance of the surface along its normal. That surface
+is a plane through clusters of many slices. With the plane solved for within, one row is left: distance = survey - sum
+of shares x clusters, with the variance of both. Such a row touches all slices that saw the place. It is applied as it
+is, and is part of no sparse matrix.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,8 @@
-"""Corrections of the single lasers, as unknowns of the adjustment: a range offset and an elevation offset for each of the 32.
+"""Corrections of the single lasers as unknowns: a range offset and an elevation offset for each of the 32.
 
-Their clusters are kept apart, so that each row of the lidar has one laser. By its two unknowns a row is linear as it is by the pose, and
-the planes are solved for within as before (`planes`); what couples lasers and path is a border of 64 columns, written down once a step.
+Clusters of different lasers are kept apart, so that each row of the lidar belongs to one laser. A row is linear in the
+two unknowns of its laser, as it is in the pose, and the planes are solved for within as before (`planes`). The
+coupling of lasers and path is a border of 64 columns, formed once a step.
 """
 
 from dataclasses import dataclass

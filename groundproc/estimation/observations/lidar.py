@@ -1,7 +1,8 @@
-"""What the lidar sees, as an observation: planes of voxels and what fills them, solved for within; corrections of the single lasers.
+"""What the lidar sees, as an observation: planes of voxels and what fills them, and corrections of the single lasers.
 
-Its rows are hundreds of thousands and touch each other all over the flight, so they are no `Factor`: the engine asks for them as
-`planes.Rows`, which are applied and never written down. All else, the unknowns, the solution and the self-check, is as for the others.
+Planes and fillings are solved for within. There are hundreds of thousands of rows, coupling distant parts of the
+flight, so they are no `Factor`: the engine asks for them as `planes.Rows`, which are applied and never written down.
+Everything else, the unknowns, the solution and the self-check, is as for the other observations.
 """
 
 from collections.abc import Mapping

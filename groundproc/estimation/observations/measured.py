@@ -1,4 +1,4 @@
-"""What an observation is to the smoother: rows about a reference, of few states each, one scalar each."""
+"""What an observation is to the smoother: scalar rows about a reference, each of few states."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
-"""Positions and poses from outside, of a GNSS solution, images or another program: centimetres, for as long as the other one is right.
+"""Positions and poses from outside, of a GNSS solution, images or another program: centimetres, as long as it is right.
 
-Their errors last, as the autopilot's do. Each row gets the variance that independent errors would need for the mean of many to be as well
-known (the spectrum of an autoregressive process at frequency zero), and no differences are taken: one wrong fix is one wrong row. The
-shape from one second to the next, which the lidar knows better, is left to it.
+Their errors last, as the autopilot's do. Each row gets the variance that independent errors would need for the mean of
+many rows to be as uncertain (the spectrum of an autoregressive process at frequency zero). No differences are taken,
+so one wrong fix is one wrong row. The shape from one second to the next is left to the lidar, which knows it better.
 """
 
 from collections.abc import Mapping, Sequence

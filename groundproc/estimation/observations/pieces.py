@@ -1,4 +1,4 @@
-"""Pieces of a path between long blind stretches, laid each as a whole where good positions have them, before the first step."""
+"""Pieces of a path between long blind stretches, each laid as a whole on good positions before the first step."""
 
 from typing import Final
 

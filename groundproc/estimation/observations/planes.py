@@ -1,4 +1,4 @@
-"""What the lidar says: clusters on the planes of their voxels, as rows that tell of the path (`numerics.planerows`)."""
+"""What the lidar says: clusters on the planes of their voxels, as rows of the path (`numerics.planerows`)."""
 
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple

@@ -1,8 +1,8 @@
-"""Poses that follow each other: odometry of another program, by lidar or by images, whose steps are good and whose course drifts.
+"""Poses relative to each other: odometry of another program, by lidar or images. Its steps are good, but it drifts.
 
-Between two stamps the pose of the airframe against the one before is stated, with a covariance of six. Where the whole lies is not used.
-No file that the survey names states steps: they are handed to `adjusted_estimate` by who made them.
-A source has a clock and a lever arm of its own; the lever arm is that of the point whose poses they are.
+For each stamp, the pose of the airframe relative to the stamp before is stated, with a 6 x 6 covariance. Where the
+whole lies is not used. No file that the survey names states steps; the caller hands them to `adjusted_estimate`. A
+source has a clock and a lever arm of its own; the lever arm is that of the point whose poses they are.
 """
 
 from collections.abc import Mapping

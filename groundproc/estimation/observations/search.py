@@ -1,4 +1,4 @@
-"""Where a map may lie for its surfaces to meet the control: all shifts and turns within three sigma, tried against its patches."""
+"""Where a map may lie for its surfaces to meet the control: all shifts and turns within three sigma are tried."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What each source of positions or attitudes has of its own: the delay of its clock, and the lever arm of the point that it places."""
+"""What each source of positions or attitudes has of its own: the delay of its clock, and its lever arm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

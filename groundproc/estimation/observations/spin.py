@@ -1,12 +1,13 @@
-"""The line of the spin: what the lidar's own gyro reads at exactly the frequency of its rotor, as unknowns of the adjustment.
+"""The line of the spin: the reading of the lidar's own gyro at exactly the frequency of its rotor, as unknowns.
 
-Where that gyro carries the motion between two knots, the line is in the path: a degree per second at 10 Hz turns it by 16 mdeg to and fro.
-The turn over a slice of one revolution does not show it, and no spline with a knot a revolution follows it. So the path is turned, about
-each axis of the sensor, by a sine and a cosine of the rotor's azimuth. These six are unknowns by which the lidar's rows are linear. In
-surfaces that stand at one azimuth all the time they leave no residual; turns of the vehicle show them.
+Where that gyro carries the motion between two knots, the line is in the path: one of a degree per second at 10 Hz
+turns it by 16 mdeg to and fro. The turn over a slice of one revolution does not show it, and no spline with one knot a
+revolution follows it. The path is therefore turned, about each axis of the sensor, by a sine and a cosine of the
+rotor's azimuth. The lidar's rows are linear in these six unknowns. Surfaces that always stand at one azimuth show no
+residual from them; turns of the vehicle reveal them.
 
-The gyro itself tells the line's size and phase well. What it cannot tell is whether it is wrong there, or whether the head of the sensor
-does shake so. The share of it that is wrong is one more unknown, which the surfaces have to tell.
+The gyro itself determines the line's size and phase well. It cannot tell whether its reading is wrong, or whether the
+head of the sensor does shake. The share that is wrong is one more unknown, which the surfaces have to determine.
 """
 
 from collections.abc import Mapping, Sequence

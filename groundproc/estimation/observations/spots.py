@@ -1,4 +1,4 @@
-"""Places that surfaces of the map have to go through, and where a map is placed for them to do so."""
+"""Places that surfaces of the map have to go through, and where the map is laid for that."""
 
 from dataclasses import dataclass
 from typing import Final

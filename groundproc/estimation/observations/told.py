@@ -1,8 +1,9 @@
-"""What rows of the lidar really tell of the path, interval by interval: judged as in the odometry (`matching`), and taken into the rows.
+"""What the lidar's rows really observe of the path, interval by interval: judged as in the odometry (`matching`).
 
-Normals of flat ground have errors, and thousands of them together would seem to hold the place along it. So the ground counts by the mean
-normal of some twenty seconds; what its own normals tell beyond that, the relief, counts for no more than all else tells, direction by
-direction; and a direction that nothing tells is left to inertial data and fixes.
+Normals of flat ground have errors, and thousands of them together would seem to fix the position along it. So the
+ground counts by the mean normal of some twenty seconds. What its own normals tell beyond that, the relief, counts for
+no more than everything else, direction by direction. A direction that nothing observes is left to inertial data and
+fixes. The rows are changed accordingly.
 """
 
 from typing import Any, Final, NamedTuple

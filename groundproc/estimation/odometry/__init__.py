@@ -7,20 +7,20 @@ clusters    clusters of many slices, as columns
 voxels      a map of planes in a hash of voxels
 spline      the path of the sensor, and the spline that corrects it
 stated      positions and attitudes of the autopilot, as they become known
-state       where the sensor is, and how the inertial data carry that on
+state       where the sensor is, and its propagation by the inertial data
 matching    distances of clusters from the map, and the correction by them
-within      turns within a slice, between two corrections
+within      rotations within a slice, between two corrections
 rotor       the line of the spin, in time
-odometry    the two as an iterated error-state filter; the causal mode
+odometry    state and matching as an iterated error-state filter; the causal mode
 start       the rough pose that it begins from
-bearing     the heading of its map against the earth's
+bearing     the heading of its map against the Earth's
 history     where the sensor was in the last seconds
 surfaces    what a map holds, by kinds
 seeking     where one map may lie on another, roughly
-laying      one map put closest to another from a start on
+laying      one map fitted closely to another, from a start on
 relocation  one map laid on another metres away, or not at all
 rejoining   a path that was lost and comes back
-tracker     the forward pass over a recording or a flight that goes on: start, silent slices, fixes, loss of way
+tracker     the forward pass over a recording or a flight that goes on: start, silent slices, fixes, loss of the path
 track       what the forward pass found
 beginning   the first seconds again, backwards
 """

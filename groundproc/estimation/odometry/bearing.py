@@ -1,4 +1,4 @@
-"""The heading of the odometry's map against the earth's."""
+"""The heading of the odometry's map against the Earth's."""
 
 from dataclasses import dataclass
 from typing import Final

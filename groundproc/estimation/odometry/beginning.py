@@ -1,8 +1,8 @@
-"""The first seconds again, backwards in time: when they were flown there was no map yet, and now there is one of all that came after.
+"""The first seconds again, backwards in time, against the map of all that came after.
 
-At the start the odometry has only the inertial sensors' unknown biases and a wall or two to go by, and may slide metres along them
-before it knows better. So it is run once more from a moment when it did, with time reversed: rates and velocities change sign, forces
-and gravity do not.
+At the start there is no map, and the odometry has only a wall or two and inertial sensors of unknown bias. It may
+slide metres along the walls before it knows better. So it is run once more, from a moment when it did know, with time
+reversed: rates and velocities change sign, forces and gravity do not.
 """
 
 import copy

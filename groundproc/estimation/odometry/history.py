@@ -1,4 +1,4 @@
-"""Where the sensor was in the last seconds: what a position that comes late is compared with."""
+"""Where the sensor was in the last seconds: what a late position is compared with."""
 
 from collections import deque
 from dataclasses import dataclass

@@ -1,6 +1,7 @@
-"""One map put closest to another from a start on, with six unknowns, and how many points agree.
+"""One map fitted closely to another, from a start on, with six unknowns, and how many points agree.
 
-Points against planes, the reach narrowing. Ground counts by its mean normal, as everywhere: its own would seem to hold a place along it.
+Points are matched to planes within a narrowing reach. Ground counts by its mean normal, as everywhere: its own normals
+would seem to fix the position along it.
 """
 
 from dataclasses import dataclass

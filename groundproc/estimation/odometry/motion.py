@@ -1,7 +1,8 @@
 """Rates and specific force of the inertial sensors, on one time scale and in the sensor frame of the lidar.
 
-Two units may be there: the lidar's own (200 Hz, noisy, with offsets of tens of deg/s, but on the very clock that stamps the returns) and
-the autopilot's (10 to 400 Hz through MAVLink, better, stamped by another clock).
+There may be two units. The lidar's own comes at 200 Hz and is noisy, with offsets of tens of deg/s, but is on the very
+clock that stamps the returns. The autopilot's comes at 10 to 400 Hz through MAVLink, and is better, but is stamped by
+another clock.
 """
 
 from dataclasses import dataclass

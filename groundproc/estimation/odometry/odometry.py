@@ -1,9 +1,11 @@
 """Lidar-inertial odometry: slice after slice against the planes of those before, an iterated error-state filter.
 
-After Xu, Cai, He, Lin, Zhang, "FAST-LIO2" (2022), in its idea: inertial propagation, every return moved to the slice's end by it, and the
-state corrected by distances to planes until it stands still. The measurements here are clusters, not returns.
+The idea is that of Xu, Cai, He, Lin, Zhang, "FAST-LIO2" (2022): inertial propagation, every return moved to the end of
+its slice by it, and the state corrected by distances to planes until it no longer changes. The measurements here are
+clusters, not returns.
 
-State, and error state of 18: attitude (in the body), position, velocity, bias of the gyro, bias of the accelerometer, gravity.
+The state, and an error state of 18 components: attitude (in the body), position, velocity, bias of the gyro, bias of
+the accelerometer, gravity.
 """
 
 from dataclasses import dataclass

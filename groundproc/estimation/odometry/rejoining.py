@@ -1,10 +1,10 @@
-"""A path that was lost and comes back: what is flown after it makes a map of its own, until that is found again on the map before.
+"""A path that was lost and comes back: what follows makes a map of its own, until its place on the old map is found.
 
-While the lidar sees next to nothing, or nothing that tells the way, inertial sensors carry the path, and after some seconds it may lie
-metres off. Planes metres off are not met, or the wrong ones are: so a new map begins there. Once the lidar holds the path again, the
-new map is sought on the one before (`relocation`), within the sigma that the path then has, and again as it grows. Two searches on end
-have to agree. Then the new piece is laid on the old map as a whole, both maps become one, and what the path was off is spread over the
-stretch between.
+While the lidar sees next to nothing, or nothing that observes the motion, inertial sensors carry the path, and after
+some seconds it may be metres off. Planes metres away are not matched, or wrong ones are. So a new map begins there.
+Once the lidar holds the path again, the place of the new map on the old one is sought (`relocation`), within the sigma
+that the path then has, and again as the map grows. Two searches in a row have to agree. Then the new piece is laid on
+the old map as a whole, both maps become one, and the error of the path is spread over the stretch between.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,12 @@
-"""One map laid on another, metres away: where it may lie is searched within its sigma, and taken only where it can lie nowhere else.
+"""One map laid on another, metres away: its place is searched within its sigma, and accepted only if it is the only one.
 
-Coarse: every shift and heading within reach is tried on a grid that says which cubes hold what stands and which hold ground (correlative
-matching; Olson 2009, in its idea). Fine: from the best places that are apart, points against planes with six unknowns, the reach
-narrowing (`laying`).
+Coarse: every shift and heading within reach is tried on a grid that says which cubes hold what stands and which hold
+ground (the idea of correlative matching, Olson 2009). Fine: from the best separate places, points are fitted to planes
+with six unknowns, within a narrowing reach (`laying`).
 
-A false place is worse than none. So enough of what stands has to lie on surfaces, most of what the other map could show has to be there,
-every direction has to be told (along a corridor one is not), and against every place a metre away far more points have to speak for the
-one than for the other (in a row of equal windows they do not).
+A false place is worse than none. So four conditions must hold. Enough points of what stands lie on surfaces. Most of
+what the other map could show is there. Every direction is observed (along a corridor one is not). And far more points
+favour this place than any other a metre away (in a row of equal windows they do not).
 """
 
 from dataclasses import replace

@@ -1,10 +1,11 @@
-"""The line of the spin, in time: what the lidar's own gyro reads at the frequency of its rotor, found from all that was read so far.
+"""The line of the spin, in time: the reading of the lidar's gyro at the frequency of its rotor, from all data so far.
 
-A degree per second at 10 Hz turns the path by 16 mdeg to and fro, within each slice alike. The azimuth of the returns says where the rotor
-is, and a sine and a cosine of it are found in the readings, less their mean over one revolution: that leaves the line as it is and takes
-away what is slow. Gusts at that frequency are no line, and average out; until they have, the line is believed by as much as it stands out.
+A line of a degree per second at 10 Hz turns the path by 16 mdeg to and fro, within each slice alike. The azimuth of
+the returns says where the rotor is. A sine and a cosine of it are fitted to the readings, less their mean over one
+revolution: that keeps the line and removes what is slow. Gusts at that frequency are no line, and average out. Until
+they have, the line is believed to the extent that it stands out.
 
-All of it is taken to be the gyro's error. Whether the head does shake so, only the adjustment can tell, by surfaces.
+All of it is taken to be the gyro's error. Only the adjustment can tell, by surfaces, whether the head really shakes.
 """
 
 from dataclasses import dataclass, field

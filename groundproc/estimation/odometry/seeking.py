@@ -1,7 +1,7 @@
 """Where one map may lie on another, roughly: every shift and heading within reach, tried on a grid.
 
-The grid says which cubes hold what stands and which hold ground (correlative matching; Olson 2009, in its idea). Over a wide reach
-with cubes of 2 m first, and around the best places with cubes of 1 m.
+The grid says which cubes hold what stands and which hold ground (the idea of correlative matching, Olson 2009). Over a
+wide reach, cubes of 2 m are tried first, and cubes of 1 m around the best places.
 """
 
 from typing import Final, NamedTuple

@@ -1,4 +1,4 @@
-"""Where the odometry begins, and begins anew after it lost its way: at a rough pose of the autopilot."""
+"""Where the odometry begins, and begins anew after it lost the path: at a rough pose of the autopilot."""
 
 from typing import Final, Protocol
 

@@ -1,6 +1,7 @@
-"""State of the odometry and how the inertial data carry it on.
+"""State of the odometry and its propagation by the inertial data.
 
-Error state of 18: attitude (in the body), position, velocity, bias of the gyro, bias of the accelerometer, gravity.
+The error state has 18 components: attitude (in the body), position, velocity, bias of the gyro, bias of the
+accelerometer, gravity.
 """
 
 from dataclasses import dataclass

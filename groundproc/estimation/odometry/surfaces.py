@@ -1,4 +1,4 @@
-"""What a map holds, by kinds: what is laid on another map, and what it is laid on."""
+"""What a map holds, by kinds: the surfaces that are laid on another map, or that another map is laid on."""
 
 from dataclasses import dataclass
 from typing import Final

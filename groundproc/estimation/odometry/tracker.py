@@ -1,4 +1,4 @@
-"""Drives the odometry slice by slice, over a recording or while the flight goes on: start, silent slices, fixes, loss of way."""
+"""Drives the odometry over a recording or during a flight: start, silent slices, fixes, loss of the path."""
 
 from typing import Final
 

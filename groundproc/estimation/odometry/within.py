@@ -1,12 +1,14 @@
-"""Turns within a slice: how far the sensor's attitude was off at each moment of it, from the slice's own returns.
+"""Rotations within a slice: the error of the sensor's attitude at each moment of it, from the slice's own returns.
 
-Between two corrections of the filter, a tenth of a second apart, the gyro's noise adds up to some hundredths of a degree: white noise,
-and vibration faster than it is read, which aliases. The filter corrects a slice as one rigid piece. The returns of a slice are of known
-moments, so they tell more: a chain of turns every 10 ms, each tied to the next by the gyro's noise, to what was found at the end of the
-slice before, and to the surfaces of the map. It is small, and solved at once.
+Between two corrections of the filter, a tenth of a second apart, the gyro's noise adds up to some hundredths of a
+degree. That noise is white, plus vibration faster than the sampling, which aliases. The filter corrects a slice as one
+rigid piece. But the returns of a slice have known times, so they tell more. They determine a chain of rotations every
+10 ms, tied to each other by the gyro's noise, to what was found at the end of the slice before, and to the surfaces of
+the map. The chain is small, and is solved at once.
 
-The filter's turn stays the slow part: the chain is drawn back to it, as the errors of a gyro are that something else corrects. Neither
-positions nor the map nor what the filter goes on with are touched: fed back, the map would hold what the chain had made of its errors.
+The filter's rotation stays the slow part: the chain is drawn back to it, like the error of a gyro that something else
+corrects. Neither positions nor the map nor the filter's own state are changed. Fed back, the map would keep the errors
+of the chain.
 """
 
 from typing import Final, NamedTuple
