@@ -49,7 +49,7 @@ class Steps:
     drift_m2 : ndarray, shape (n,)
         Variance that the witness has gained since the first moment [m^2].
     loose_m : ndarray, shape (n, m)
-        What of the difference goes with a value that is not known, one sigma of it: a bearing, an age.
+        The part of the difference that depends on an unknown value (a bearing, a delay), for one sigma of that value.
     """
 
     sigma_m: Array
@@ -145,9 +145,10 @@ def _looked_back(time_s: Array, previous: Ints, i: int) -> Ints:
 
 
 def doubt(time_s: Array, off_m: Array, kept: Mask) -> Array:
-    """Variance of where the kept ones have the whole, shape (k,) [m^2], from a shift at either end that is never taken back.
+    """Variance of the place of the whole, shape (k,) [m^2], from a shift at either end that is never taken back.
 
-    Which side of it is wrong nobody can tell: each is as likely as its share of the time. What comes back to where it was is in no doubt.
+    Nobody can tell which side of such a shift is wrong: each is right with a likelihood that is its share of the time.
+    Fixes that come back to where they were are not in doubt.
     """
     if kept.all() or not kept.any():
         return np.zeros(off_m.shape[1])

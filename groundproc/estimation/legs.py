@@ -14,7 +14,7 @@ from groundproc.trajectory.trajectory import Trajectory, joined
 def leg_by_leg(given: Given, make: Callable[[Leg, PositionFixes], Trajectory]) -> Trajectory:
     """The legs' trajectories one after the other; a boot that never had a fix leaves a gap.
 
-    A boot that went on over a jump of the lidar's clock belongs to two legs: each has its own side.
+    A boot that continued over a jump of the lidar's clock belongs to two legs, one on either side of the jump.
 
     Parameters
     ----------

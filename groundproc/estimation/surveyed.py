@@ -89,8 +89,8 @@ def covariance_beside(path: Path) -> Path | None:
 def with_covariance(solution: Solution, path: Path) -> Solution:
     """Poses with the full covariance of a covariance.npz.
 
-    Sigmas that the table states go before those of the file, as for a trajectory of ours: between the times of the file the correlations
-    are interpolated, and so are the sigmas where the table has none.
+    Sigmas that the table states take precedence over those of the file, as for a trajectory of ours. Correlations are
+    interpolated between the times of the file, and so are sigmas where the table has none.
 
     Raises
     ------

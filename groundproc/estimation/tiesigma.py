@@ -19,10 +19,10 @@ _MOST_RAD: Final = np.pi / np.sqrt(3.0)
 
 
 def with_tie_sigma(trajectory: Trajectory, timeline: Sequence[Leg]) -> tuple[Trajectory, str]:
-    """A trajectory whose sigmas hold the share of the clocks; and a warning where that share is the larger one.
+    """A trajectory whose sigmas include the share of the clocks, and a warning where that share is the larger one.
 
-    Positions get speed times sigma, angles the body's rate about their axis times sigma (to first order in pitch and roll). The sigma is
-    that of the tie at its reference, and of its drift away from there.
+    Positions get speed times sigma; angles get the body's rate about their axis times sigma (to first order in pitch
+    and roll). The sigma is that of the tie at its reference time, and grows with its drift away from there.
 
     Parameters
     ----------

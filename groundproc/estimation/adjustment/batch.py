@@ -48,11 +48,11 @@ class Batch:
     mat_sensor_ins : ndarray, shape (3, 3)
         Nominal boresight.
     free : float
-        Share of the prior of the whole's turn and shift: next to nothing where the window before says how the whole lies.
+        Share of the prior of the whole's turn and shift; next to nothing where the previous window fixes how the whole lies.
     log : list of dict
         What each step said.
     told : callable
-        Is called after each step.
+        Called after each step.
     """
 
     path: Path

@@ -58,10 +58,11 @@ def unheld(track: Track) -> Mask:
 
 
 def misleading(track: Track) -> Mask:
-    """Slices in which the lidar sees enough, and nothing that tells the way, shape (n,): what it seems to tell is noise.
+    """Slices whose lidar sees enough but does not observe the motion, shape (n,): what it seems to tell is noise.
 
-    Where a single direction is missing, along a street or a bank, the others are good, and the adjustment has the one from inertial
-    sensors and fixes. A lidar that has led astray once is believed where it holds the path firmly and nowhere else.
+    If a single direction is missing, as along a street or a bank, the others are good, and the adjustment takes the
+    missing one from inertial sensors and fixes. A lidar that has led astray once is believed only where it holds the
+    path firmly.
     """
     limit_m = SURE_HELD_M if track.astray else TELLS_M
     found = (np.array(track.next_unheld_m) > limit_m) & ~_silent(track)
@@ -123,9 +124,9 @@ def stretches(given: Mask, start_ns: int) -> list[Stretch]:
 
 
 def bridged(made: Trajectory, begun: Trajectory, parts: Sequence[Stretch]) -> Trajectory:
-    """A trajectory whose loose stretches have the motion of another, laid between the good poses at their ends.
+    """A trajectory whose loose stretches have the motion of another one, laid between the good poses at their ends.
 
-    What the ends do not agree on is spread evenly over the time between them.
+    The disagreement of the two ends is spread evenly over the time between them.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ def patches_of(gathered: Clusters, path: Path, window: int) -> Patches:
 
 
 class _Merged(NamedTuple):
-    """What the clusters of each voxel make together.
+    """The merged clusters of each voxel.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class _Merged(NamedTuple):
     scatter_m2 : ndarray, shape (voxels, 6)
     returns : ndarray, shape (voxels,)
     kind : ndarray of int64, shape (voxels,)
-        0 for ground, 1 for other planes, -1 for what is none.
+        0 for ground, 1 for other planes, -1 for no plane.
     draw : ndarray, shape (voxels,)
         In [0, 1), by the place.
     """

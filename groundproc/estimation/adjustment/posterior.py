@@ -59,8 +59,8 @@ class Spread:
     def moments(self, of: Callable[[Array], Array]) -> tuple[Array, Array]:
         """Covariance of linear functions of the unknowns, shape (n, k), as two parts of shape (n, k, k).
 
-        The first is known, the second is drawn: a difference, which by itself need be no covariance. The diagonal of their sum is
-        `variance` where that of the second is positive.
+        The first is known exactly. The second is drawn: it is a difference, and by itself need not be a covariance.
+        The diagonal of their sum is `variance` where that of the second is positive.
         """
         known = np.zeros_like(_outer(of(self.whole[0])))
         for column in self.columns:

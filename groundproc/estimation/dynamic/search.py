@@ -52,7 +52,7 @@ class Found:
         Root mean square by which ground models, and upright things in plan, differ from the reference before and after the steps of
         this revolution [m]; nan where there is no reference, or they are not compared.
     pixels : int
-        That the ground models have in common.
+        Pixels that the ground models have in common.
     evaluations : int
     """
 

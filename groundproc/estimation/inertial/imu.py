@@ -115,10 +115,10 @@ class Signal:
 
 
 def noise_density(samples: Samples, time_s: Array) -> Array:
-    """Power spectral density of the noise about some times, shape as these: what a cubic through six samples leaves, taken as white.
+    """Power spectral density of the noise about some times, shape as these: the residual of a cubic through six samples.
 
-    Motion that the samples are too slow for counts as noise, for it is what integrating them will miss; it changes in flight, and so
-    the mean is that of `NOISE_S` around.
+    The residual is taken as white. Motion that the samples are too slow for counts as noise, because it is what
+    integrating them will miss. It changes in flight, so the mean is over `NOISE_S` around each time.
     """
     count = len(samples.time_s) // 6
     if count < 5:
@@ -138,10 +138,11 @@ def noise_density(samples: Samples, time_s: Array) -> Array:
 
 
 def white_share(mean: Array, good: Mask, step_s: float, density: float) -> float:
-    """How much of a density is white and so goes on down to the slowest motion; the rest is vibration, which integrates to nothing.
+    """The share of a density that is white, and so continues down to the slowest motion; the rest is vibration.
 
-    Rotors push accelerometers by 1 to 2 m/s^2 between 10 and 40 Hz, the lidar's own by 0.4. Taken for white that was 20 times their noise:
-    matrices came out 1.1 to 1.3 times too large, the noisier readings were followed, and heights went astray in turns.
+    Vibration integrates to nothing. Rotors push accelerometers by 1 to 2 m/s^2 between 10 and 40 Hz, the lidar's own
+    by 0.4. Taken for white, that was 20 times their noise: matrices came out 1.1 to 1.3 times too large, the noisier
+    readings were followed, and heights went astray in turns.
 
     Parameters
     ----------
@@ -164,8 +165,8 @@ def white_share(mean: Array, good: Mask, step_s: float, density: float) -> float
 def step_means(samples: Samples, nodes_s: Array, longest_s: float, smooth: bool) -> tuple[Array, Mask]:
     """Mean over each step between nodes, shape (n - 1, 3), and where the samples have no hole.
 
-    Piecewise cubic between samples: linear would add 0.025 deg/sqrt(s) where rotors shake a sensor that is read irregularly. With
-    `smooth` the spline of continuous curvature, for samples that are few.
+    The curve between samples is piecewise cubic: a linear one would add 0.025 deg/sqrt(s) where rotors shake a sensor
+    that is read irregularly. With `smooth` it is the spline of continuous curvature, for samples that are few.
     """
     time_s, value = samples.time_s, samples.value
     within = np.clip(nodes_s, time_s[0], time_s[-1])
@@ -214,8 +215,8 @@ def align(
 ) -> Alignment:
     """Fit slow = matrix @ fast + offset - levers @ lever, robustly.
 
-    The slow part of the fast readings is the instrument of the fit (instrumental variables): what stamps that jitter and filters take from
-    fast motion would otherwise pass for a scale.
+    The slow part of the fast readings is the instrument of the fit (instrumental variables). Otherwise, the fast
+    motion that is lost to jittering stamps and filters would be taken for a scale error.
 
     Parameters
     ----------

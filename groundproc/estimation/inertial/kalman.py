@@ -150,10 +150,11 @@ def _others(but: int, left: Array, right: Array) -> float:
 
 @njit(cache=True, nogil=True)
 def _undo_all(row: int, rows: Rows, gain: Array, information: float, n: Array, work: Array) -> None:
-    """Carry the adjoint's matrix back over a measurement far better than what was known before it: (I - K H)' N (I - K H) + H' H / S.
+    """Carry the adjoint's matrix back over a measurement that is far better than what was known before it.
 
-    Of N next to nothing is left then. As a difference of its terms that would be their rounding, which the covariance before the
-    measurement, practically unknown, makes larger than what is sought; as a product it has digits of its own.
+    It is (I - K H)' N (I - K H) + H' H / S. Next to nothing of N is left then. Computed as a difference of its terms,
+    that would be their rounding error, magnified by the covariance before the measurement, which is practically
+    infinite. As a product it has digits of its own.
     """
     count, index, value = rows.coefficients[row], rows.state[row], rows.value[row]
     for c in range(count):

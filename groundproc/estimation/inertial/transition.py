@@ -43,7 +43,7 @@ class Motion(NamedTuple):
     angle_rad, push_m_s : ndarray, shape (n - 1, 3)
         Angle turned in it, and specific force times its length, in the ins frame.
     steady_m_s : ndarray, shape (n - 1, 3)
-        The same push without what shakes: what scale and misalignment of the accelerometers act on. Of a noisy reading they would explain
+        The same push without vibration, on which scale and misalignment of the accelerometers act. On a noisy reading they would explain
         its noise by itself.
     rate_density, force_density : ndarray, shape (n - 1,)
         Power spectral density of the noise of both [rad^2/s], [m^2/s^3].
@@ -71,10 +71,10 @@ class Motion(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def step(k: int, motion: Motion, couple: Array, defect: Array) -> None:
-    """What couples the states over the step from node k to the next, and by how much the reference misses it.
+    """What couples the states over the step from node k to the next, and the amount by which the reference violates it.
 
-    couple[0]: force times step turned into the local frame; couple[1:4]: matrix of the step's middle; couple[4]: angles turned; couple[5]:
-    steady force times step.
+    couple[0]: force times step turned into the local frame; couple[1:4]: matrix of the step's middle; couple[4]:
+    angles turned; couple[5]: steady force times step.
     """
     position, velocity, quat = motion.position_m, motion.velocity_m_s, motion.quat
     angle, push = motion.angle_rad, motion.push_m_s

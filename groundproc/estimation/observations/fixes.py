@@ -69,7 +69,7 @@ LIVELY_SIGMAS: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """What the lidar's way says of the fixes: some were left out because they contradict it.
+    """What the lidar's path says of the fixes: some were left out because they contradict it.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Left:
     farthest_m : float
         Largest distance from where the others have the path.
     doubt_m2 : ndarray, shape (3,)
-        Variance of where the whole lies, as far as nobody can tell which of them are right.
+        Variance of where the whole lies, where nobody can tell which of the fixes are right.
     strain : float
         How many times more than stated horizontal errors change within seconds.
     """
@@ -198,10 +198,10 @@ def of_run(flown: Flown) -> list[Observation]:
 
 
 def without_walks(given: Positions, stretch: Stretch) -> tuple[Positions, Left]:
-    """Positions without those that walk away from a path that the lidar holds, and what was left out.
+    """Positions without those that drift away from a path that the lidar holds, and what was left out.
 
-    A receiver that is led astray by walls and trees goes by metres where the lidar sees that nothing moves. The longest chain of fixes
-    that the lidar's way explains is right (`consensus`).
+    A receiver that is misled by walls and trees drifts by metres while the lidar sees that nothing moves. The longest
+    chain of fixes that agrees with the lidar's path is right (`consensus`).
     """
     inside = within(given.time_ns, stretch.path)
     if stretch.unheld_m is None or inside.sum() < 2:
@@ -229,9 +229,9 @@ def without_walks(given: Positions, stretch: Stretch) -> tuple[Positions, Left]:
 def strain_of(given: Positions, stretch: Stretch) -> float:
     """How many times more than stated the horizontal errors of the fixes change within seconds, 1 at least.
 
-    Beside walls a receiver errs by metres, otherwise every ten metres of the way. Where the lidar holds the path, what the fixes have
-    beyond its way is their error, but for a turn of the map and their age; its whitened changes, added up over some seconds, should be of
-    size one.
+    Beside walls, a receiver errs by metres, and differently every ten metres of the path. Where the lidar holds the
+    path, the deviation of the fixes from it is their error, except for a rotation of the map and their delay. The
+    whitened changes of that error, added up over some seconds, should be of size one.
     """
     inside = within(given.time_ns, stretch.path)
     if stretch.unheld_m is None or inside.sum() < 2:
@@ -290,11 +290,12 @@ def position_factors(
     given: Positions, path: Path, unknowns: Unknowns, number: int = 0, clock: Clock | None = None,
     left: Left = NOTHING_LEFT,
 ) -> list[Factor]:  # fmt: skip
-    """Positions in means of a second: their course, and their mean; none where the path covers fewer than two.
+    """Positions as means over a second: their course, and their mean; none where the path covers fewer than two.
 
-    The course alone, with an unknown mean error, bends and turns the path. Where the whole lies is left to the plain mean of the fixes,
-    by 1 / sigma^2: the best weights of errors that last would lay two thirds of a minute's weight on its first and last fix, and are best
-    by a tenth at most, if the errors last as long as stated and not otherwise.
+    The course alone, with an unknown mean error, bends and turns the path. Where the whole lies is left to the plain
+    mean of the fixes, weighted by 1 / sigma^2. The best linear weights for errors that last would put two thirds of a
+    minute's weight on its first and last fix. They are better by a tenth at most, and only if the errors last exactly
+    as long as stated.
     """
     stamps_ns = given.time_ns if clock is None else clock.ours_ns(given.time_ns)
     inside = within(stamps_ns, path)
@@ -337,9 +338,10 @@ def _mean_factor(
 ) -> Factor:  # fmt: skip
     """The mean of the residuals, shape (n, 3), as three rows.
 
-    By every coefficient of the spline they would be dense. So they are stated by a few moments of the flight, with weights by which
-    all that moves or turns the path as one moves their mean as it moves the mean of all. Bends are seen a little wrong; as the
-    residual is that of the path as it is, that costs a step and not the result.
+    In terms of every coefficient of the spline these rows would be dense. So they are expressed by a few moments of
+    the flight, with weights such that whatever moves or turns the path as a whole changes their mean as it changes the
+    mean of all. Bends are represented a little wrongly. The residual is that of the actual path, so this costs a step,
+    but does not change the result.
     """
     weights = mean_weights(residual, sigma)
     builder, row = RowBuilder(3, unknowns), np.zeros(1, np.int64)

@@ -24,10 +24,11 @@ RATE_STEPS: Final = 5
 
 
 def knot_rates(path: Path) -> Array:
-    """Body rates at the knots [rad/s], shape (intervals + 1, 3): means over `RATE_STEPS` grid steps to either side, over one at the ends.
+    """Body rates at the knots [rad/s], shape (intervals + 1, 3): means over `RATE_STEPS` grid steps to either side.
 
-    As much before a knot as behind it: a rate from before it goes along with the vibration in the turn that ends there, and a delay of
-    0.1 to 0.6 ms came of it that was none.
+    At the ends, the mean is over one step. Elsewhere it must reach as far before a knot as behind it. A rate from
+    before the knot correlates with the vibration in the turn that ends there, which produced false delays of 0.1 to
+    0.6 ms.
     """
     knot = np.arange(0, len(path.quat), STEPS)
     around = np.full(len(knot), RATE_STEPS)

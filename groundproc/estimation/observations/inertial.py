@@ -85,10 +85,10 @@ class Inertial(Observation):
                 unknowns.add(key, np.full(len(value), PRIORS[key]), value, expected, UNITS[name])
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
-        """Turns of each slice and forces about each knot, with the noise that their residuals show once that is to be learnt.
+        """Turns of each slice and forces about each knot, with the noise of their residuals once it is to be learnt.
 
-        Learnt again and again, the path would follow the units and their noise seem to vanish. So it does where the lidar does not hold
-        the path: residuals of the rest alone tell it.
+        If the noise were learnt in every step, the path would follow the units, and their noise would seem to vanish.
+        The same happens where the lidar does not hold the path, so only residuals from elsewhere are used.
         """
         unit = self._begun()
         turn = gyro.turn_factor(unit, state.path, unknowns, state.spin_rad if self.carries else None)

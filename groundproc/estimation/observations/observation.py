@@ -63,9 +63,9 @@ class Stretch:
     whole : bool
         The window is the whole flight: nothing is joined afterwards.
     unheld_m : ndarray, shape (slices,), optional
-        How well each slice of the lidar holds the path, in the direction that it tells least of; none where it has led astray.
+        How well each slice of the lidar holds the path in its least observed direction; none where it has led astray.
     held : ndarray of bool, shape (slices,), optional
-        Slices in which the lidar tells every direction of the path, as far as it knows.
+        Slices in which the lidar observes every direction of the path, as far as it knows.
     """
 
     path: Path

@@ -343,11 +343,12 @@ def _lasting(time_ns: Ints, tau_s: Array) -> Array:
 
 
 def _weighed(name: str, residual: Array, matrix: sparse.csr_matrix, covariance: Array, inflation: Array) -> Factor:
-    """Rows made independent and of unit noise, those far from where the others lie with less weight.
+    """Rows made independent and of unit noise; those far from where the others lie get less weight.
 
-    What is usual is told by the rows themselves, about their median: before the path is where it belongs all are off alike, and a
-    file whose sigmas are too small all over does not make all of them wrong. The loss goes on linearly (Huber), because where the
-    lidar was blind it is the path that is far off, and must be pulled back.
+    The usual size of residuals comes from the rows themselves, about their median. Before the path is where it
+    belongs, all rows are off alike, and a file whose sigmas are all too small does not make all of them wrong. The
+    loss grows linearly (Huber), because where the lidar was blind it is the path that is far off, and must be pulled
+    back.
     """
     spread = np.linalg.cholesky(covariance)
     centred = residual - np.median(residual, axis=0)

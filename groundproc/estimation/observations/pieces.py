@@ -26,10 +26,11 @@ FEWEST_OF_PIECE: Final = 5
 
 
 def laid_by_pieces(path: Path, time_ns: Ints, stated_m: Array, lever_m: Array, sigma_m: float, view: Mask) -> Path:
-    """A path whose pieces between long blind stretches lie, each as a whole, where the positions have them.
+    """A path whose pieces between long blind stretches are each laid, as a whole, where the positions have them.
 
-    After a blind stretch the odometry goes on from where its inertial sensors had drifted to, beside its own map. A metre is too far for
-    the planes of both pieces to meet, and soft enough for a wrong meeting to hold.
+    After a blind stretch, the odometry continues from where its inertial sensors had drifted to, beside its own map. A
+    metre is too far for the planes of both pieces to be matched correctly, and near enough for a wrong match to
+    persist.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class Model:
     gyro_scale, gyro_misalignment : float
         Relative, and [rad].
     force_scale, force_misalignment : float
-        The same of the accelerometers: of MEMS as sold 3 % and 2 %, and half of that and less once calibrated on six sides.
+        The same of the accelerometers: MEMS as sold have 3 % and 2 %, half of that or less once calibrated on six sides.
     fix_tau_s, fix_velocity_tau_s : float
         GM error of positions (sigma: as the fixes state it) and of velocities.
     fix_velocity_m_s : float
@@ -75,7 +75,7 @@ class Model:
     tilt_rad, tilt_tau_s, tilt_noise_rad : float
         The autopilot's pitch and roll: GM (learnt) and white noise (learnt).
     heading_rad, heading_tau_s, heading_noise_rad : float
-        What its heading's error is beyond the compass curve: GM (learnt) and white noise (learnt).
+        Error of its heading beyond the compass curve: GM (learnt) and white noise (learnt).
     compass_rad : tuple of float
         Constant, first and second harmonic of the compass curve.
     baro_m, baro_walk, baro_noise_m : float
@@ -142,8 +142,8 @@ def start_covariance(model: Model, fix_sigma_m: Array, linked: bool, outside_sig
 def fix_velocity_sigma(model: Model, fix_sigma_m: Array, linked: bool) -> Array:
     """Sigma of the velocities' correlated error [m/s], shape (3,).
 
-    Where velocities are those of the stated positions (linked), their error is what moves the positions' error: a Gauss-Markov process
-    of that sigma, run through another of `fix_tau_s`, has the positions' sigma.
+    If the velocities are those of the stated positions (linked), their error is the rate of change of the positions'
+    error. A Gauss-Markov process of that sigma, passed through another of `fix_tau_s`, has the positions' sigma.
     """
     if not linked:
         return np.full(3, model.fix_velocity_m_s)

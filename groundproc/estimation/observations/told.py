@@ -45,12 +45,13 @@ class Poses(NamedTuple):
 
 
 def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m: Array) -> None:
-    """Leave in the rows of each interval what they really tell.
+    """Leave in the rows of each interval what they really observe.
 
-    Judged on the axes of the map: on those of a body that tilts within the interval, what is unseen would change with it, and each change
-    of tilt would seem to tell a little of the heading. Where the heading is not seen at all, tilts count no more than the shape of the
-    path between two knots is known: a gyro's offset about the vertical shows in them by the small part that a body leans, and what is
-    far below that noise would settle it wrongly.
+    This is judged on the axes of the map. On the axes of a body that tilts within the interval, the unobserved
+    direction would change with the body, and each change of tilt would seem to tell a little of the heading. Where the
+    heading is not observed at all, tilts count no more than the shape of the path between two knots is known. A gyro's
+    bias about the vertical shows in the tilts by the small amount that a body leans, and an effect far below that
+    noise would determine it wrongly.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ def make_unit(name: str, track: ImuTrack, path: Path, bias: Array, lever: Array)
 def learnt_sigma(residual: Array, held: npt.NDArray[np.bool_], scatter: float, least: float) -> float:
     """Noise of a unit by its residuals where the lidar holds the path, from the median absolute deviation.
 
-    Where nothing holds it the path is the unit's own and leaves no residuals.
+    Where nothing else holds the path, it is the unit's own and leaves no residuals.
 
     Parameters
     ----------

@@ -16,10 +16,10 @@ LARGEST_BEARING: Final = 0.35
 
 @dataclass(slots=True)
 class Bearing:
-    """The heading of the odometry's map against the earth's, by the way flown and the fixes.
+    """The heading of the odometry's map against the Earth's, by the path and the fixes.
 
-    The map takes its axes from the first attitude. With a compass that is 6 deg off a straight street of 200 m ends 20 m beside the
-    fixes, and nothing is wrong with the way.
+    The map takes its axes from the first attitude. With a compass that is 6 deg off, a straight street of 200 m ends
+    20 m beside the fixes, and nothing is wrong with the path.
 
     Attributes
     ----------

@@ -126,10 +126,10 @@ class Sums(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def observable(information: Array, least: float) -> Array:
-    """Projection of a pose's correction, shape (6, 6), onto what planes really tell of it.
+    """Projection of a pose's correction, shape (6, 6), onto the directions that planes really observe.
 
-    Of directions that get less than a share `least` of the information nothing is taken (after Zhang, Kaess, Singh 2016). Turns count by
-    what they move at the mean distance.
+    Nothing is taken of directions that get less than a share `least` of the information (after Zhang, Kaess, Singh
+    2016). Rotations are measured by the motion at the mean distance.
     """
     turn = information[0, 0] + information[1, 1] + information[2, 2]
     shift = information[3, 3] + information[4, 4] + information[5, 5]
@@ -181,9 +181,10 @@ def _match(
     planes: MapArrays, clusters: _Clusters, pose: tuple[Array, Array], gate_m: float, found: _Matches,
     ground: tuple[Array, float, Array],
 ) -> int:  # fmt: skip
-    """Voxel of each cluster, -1 where it finds neither a plane nor one that is filled, with distance and weight of planes.
+    """Voxel of each cluster, -1 if it finds no plane and no filled voxel, with distance and weight of planes.
 
-    `ground` is its mean normal so far, up; the cosine of what leans from it and belongs to it; and the sum that such normals are added to.
+    `ground` holds three things: its mean normal so far, pointing up; the cosine of the largest lean from it that still
+    belongs to the ground; and the sum that such normals are added to.
     """
     table, keys, voxels, voxel_m = planes
     up, cone, total = ground
@@ -239,10 +240,11 @@ def _add_filled(
     voxel: tuple[Array, int], mat: Array, body: tuple[float, float, float], off: Array, count: int, voxel_m: float, sums: Sums,
     memory: tuple[Array, Array],
 ) -> None:  # fmt: skip
-    """Three rows along the axes of what fills a voxel, one row of the map's, to all that is not ground; working memory (6,), (3, 3).
+    """Add three rows, along the axes of what fills a voxel (one row of the map's), to the sums of all that is not ground.
 
-    The mean of a few returns lies about that of the voxel by its spread. What is cut off by the voxel's faces does not move them with
-    the path: evenly filled from face to face, a spread of edge / sqrt(12), it tells nothing.
+    The mean of a few returns lies about that of the voxel by its scatter. The points cut off by the voxel's faces do
+    not move with the path. Evenly filled from face to face, with a scatter of edge / sqrt(12), a voxel tells nothing.
+    Working memory: (6,), (3, 3).
     """
     (voxels, v), (j, axis) = voxel, memory
     for c in range(3):
@@ -381,12 +383,12 @@ def weakest(information: Array) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True)
 def told(sums: Sums) -> Normal:
-    """What a slice tells of the pose: all by mean normals, and of the ground's relief no more than `RELIEF` times as much.
+    """What a slice tells of the pose: all by mean normals, of the ground's relief at most `RELIEF` times as much.
 
-    Normals of flat ground have errors, and thousands of them would seem to hold a place along it, and brake the path where nothing
-    else holds it. So the ground counts by its mean normal. Not by the vertical: the map leans by what the start's tilt was off, and a
-    turn about any other axis than the ground's own normal tilts it. Where walls and trees hold the path as well, the relief's own
-    normals are right enough to help.
+    Normals of flat ground have errors. Thousands of them would seem to fix the position along it, and would brake the
+    path where nothing else holds it. So the ground counts by its mean normal. The vertical would not do: the map leans
+    by the error of the first tilt, and a rotation about any axis but the ground's own normal tilts it. Where walls and
+    trees hold the path as well, the relief's own normals are right enough to help.
     """
     base, pull = sums.rest.information + sums.level.information, sums.rest.pull + sums.level.pull
     judged = sums.facing.information + sums.level.information

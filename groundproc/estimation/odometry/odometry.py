@@ -51,7 +51,7 @@ class Step:
     residual_m : float
         RMS distance from it.
     unheld_m, next_unheld_m : float
-        Sigmas of the two directions that they tell least of; infinite before there is a map.
+        Sigmas of the two directions that they observe least; infinite before there is a map.
     quats : ndarray, shape (STEPS + 1, 4)
         Attitudes on the grid over the slice, corrected, as they are stated.
     """

@@ -47,21 +47,21 @@ class Track:
         Clusters that found a plane, and all.
     residual_m : list of float
     unheld_m, next_unheld_m : list of float
-        Sigmas of the two directions that a slice tells least of.
+        Sigmas of the two directions that a slice observes least.
     quats : list of ndarray or None
         Attitudes on the grid of each slice, shape (STEPS + 1, 4); None where nothing was seen.
     restarts : int
-        How often it lost its way.
+        How often it lost the path.
     astray : int
-        How often that was told by a guide: what seemed to hold the path did not.
+        How often a guide revealed that: what seemed to hold the path did not.
     fixes, late_fixes : int
-        Positions that were used, and those that came too late for it.
+        Positions that were used, and those that came too late.
     voxel_m : float
-        Edge of the odometry's voxels at last.
+        Final edge of the odometry's voxels.
     rejoined : list of dict
         Pieces that were found again on the map before them, for the report.
     apart : int
-        Pieces before the last one that it was not found on.
+        Earlier pieces on which the last one was not found.
     """
 
     first: int
@@ -169,9 +169,10 @@ def thinned(clusters: npt.NDArray[np.void], world_m: Array, planes: PlaneMap, mo
 
 
 def shares_by_direction(normal: Array, most: float) -> Array:
-    """Part of planes to keep, so that every direction gets about as much, whatever the axes are: few ends of cars beside long walls.
+    """Share of the planes to keep so that every direction, whatever the axes, gets about as much.
 
-    By leverage, n^T (sum of n n^T)^-1 n, which sums up to one for each direction; what is kept whole leaves the rest to the others.
+    Planes are kept by leverage, n^T (sum of n n^T)^-1 n, which sums up to one for each direction. A plane whose share
+    reaches one is kept whole, and leaves the rest to the others. A few ends of cars thus count beside long walls.
 
     Parameters
     ----------

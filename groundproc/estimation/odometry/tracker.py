@@ -55,10 +55,10 @@ FEWEST: Final = 20
 
 
 class Tracker:
-    """The odometry with what keeps it going: start, silent slices, what the autopilot states, loss of way.
+    """The odometry with what keeps it going: start, silent slices, what the autopilot states, loss of the path.
 
-    The causal method and the live view drive the same object; what differs between them is behind `MotionGrid`, `RoughPoses` and
-    `Stated`.
+    The causal method and the live view drive the same object; what differs between them is behind `MotionGrid`,
+    `RoughPoses` and `Stated`.
 
     Parameters
     ----------
