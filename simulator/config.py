@@ -52,6 +52,9 @@ class GyroOptions:
     offset_walk_deg_s: float = option(
         0.0, "random walk of the zero offsets, one sigma after a minute [deg/s]", minimum=0, maximum=10
     )
+    delay_s: float = option(
+        0.0, "readings are older than their stamps by this, accelerometers' too [s]", minimum=-0.1, maximum=0.1
+    )
     scale: float = option(
         0.0, "scale factor error of each gyro, one sigma over seeds, relative", minimum=0, maximum=0.5
     )

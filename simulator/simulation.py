@@ -157,6 +157,7 @@ class Simulation:
             "lidar_minus_boot_ppm": lidar.drift_ppm - boot.drift_ppm,
             "ins_gyro_delay_s": job.options.ins.gyro_delay_s,
             "ins_position_delay_s": job.options.ins.position_delay_s,
+            "lidar_imu_delay_s": job.options.gyros.delay_s,
             "mount_nominal": to_mapping(self.nominal_mount),
             "mount_true": to_mapping(self.mount),
             "boresight_deg": self._boresight_deg(),

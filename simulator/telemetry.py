@@ -110,12 +110,13 @@ class Telemetry:
     def _words(self, time_s: Array, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
         """Gyro, temperature, accelerometer X and Y of the three chips, with channel tags, shape (n, 12)."""
         o = self._options
+        felt_s = time_s - o.delay_s
         turn = 2 * np.pi * self._rotor_hz * time_s[:, None]
-        rates = np.degrees(self._flight.rates_rad_s(time_s)) @ self._mat_lidar_ins.T
+        rates = np.degrees(self._flight.rates_rad_s(felt_s)) @ self._mat_lidar_ins.T
         gyros = self.gyros.read(rates @ SENSOR_FROM_GYROS.astype(np.float64)) + self.gyro_wander.at(time_s)
         gyros = gyros + o.noise_deg_s * rng.standard_normal(gyros.shape)
         gyros = gyros + np.array(o.rotor_line_deg_s) * np.sin(turn + np.array([0.3, 1.9, 3.1]))
-        force = self._flight.specific_force_m_s2(time_s, self._lever_m) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
+        force = self._flight.specific_force_m_s2(felt_s, self._lever_m) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
         # readings are the pull of gravity along the labelled arrow, minus the specific force: X up is -z on chips 1 and 2
         x, y, z = force.T
         accel = np.stack([z, -x, z, -y, x, -y], axis=1)

@@ -18,7 +18,7 @@ from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, pa
 from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
 from groundproc.estimation.observations import lasers
-from groundproc.estimation.observations.inertial import carried_density, gyro_readings
+from groundproc.estimation.observations.inertial import carried_density, gyro_readings, retiming_of
 from groundproc.estimation.observations.lidar import Lidar
 from groundproc.estimation.observations.observation import Observation, Stretch
 from groundproc.estimation.observations.rows import H, Unknowns
@@ -47,7 +47,7 @@ SMOOTH: Final = 11
 SMOOTH_DRAWS: Final = 101
 """Slices over which variances of poses are averaged, and correlations of what is drawn: ten seconds hold several times the errors that
 one knot has, and a leg of the flight is longer."""
-CALIBRATION: Final = ("ins.turn", "ins.lever", "ins.scale", "ins.delay", "ins.drift")
+CALIBRATION: Final = ("ins.turn", "ins.lever", "ins.scale", "ins.delay", "ins.drift", "lidar.delay")
 """What other flights go by: their covariance is not drawn, but solved for column by column."""
 
 
@@ -176,7 +176,7 @@ def adjust_window(
         None if track.restarts else unheld_m, unheld_m <= TELLS_M,
     )  # fmt: skip
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
-    lidar = Lidar(track.gathered(first, last, sources.lasers_apart))
+    lidar = Lidar(track.gathered(first, last, sources.lasers_apart), retiming=retiming_of(observations, motion.source))
     if motion.source == LIDAR:
         lidar.spin = spin_of(lidar.clusters, path)
         if lidar.spin is not None:

@@ -11,7 +11,7 @@ example.
 
 observation, measured   what an observation is to the adjustment and to the smoother
 rows, moments, source   sparse rows; times on a path; clock and lever arm of a source
-lidar                   planes and what fills voxels (planes, filled, told, lasers, spin), applied without a matrix
+lidar                   planes and what fills voxels (planes, filled, told, lasers, retiming, spin), applied without a matrix
 fixes, attitudes        positions and attitudes of the autopilot, with the compass
 inertial                units of gyro and accelerometer (unit, gyro, accelerometer)
 outside, relative       poses from elsewhere: where they are, and how they follow each other

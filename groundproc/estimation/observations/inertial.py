@@ -10,6 +10,7 @@ import numpy.typing as npt
 from flightlog import frames
 from groundproc.estimation.observations import accelerometer, gyro
 from groundproc.estimation.observations.observation import Flown, Observation, State, Stretch
+from groundproc.estimation.observations.retiming import Retiming
 from groundproc.estimation.observations.rows import Carrying, Factor, H, Unknowns, turned
 from groundproc.estimation.observations.unit import (
     LEAST_FORCE,
@@ -26,9 +27,12 @@ from groundproc.estimation.odometry.spline import Path
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-PRIORS: Final[dict[str, float]] = gyro.PRIORS | accelerometer.PRIORS | {"ins.delay": 0.01, "ins.drift": 60e-6}
-"""What is known before, one sigma, of the globals by their names. The lidar's own unit has the lidar's clock; of the autopilot's are
-unknown the delay beyond the synchronisation's [s] and how it drifts, two crystals against each other [s/s]."""
+PRIORS: Final[dict[str, float]] = gyro.PRIORS | accelerometer.PRIORS | {
+    "lidar.delay": 0.005, "ins.delay": 0.01, "ins.drift": 60e-6,
+}  # fmt: skip
+"""What is known before, one sigma, of the globals by their names. The lidar's own unit has the lidar's clock, but is read once in 5 ms,
+through a filter that nobody states [s]; of the autopilot's are unknown the delay beyond the synchronisation's [s] and how it drifts, two
+crystals against each other [s/s]."""
 ORDER: Final = (
     "bias", "scale", "shear", "turn", "accel_bias", "accel_scale", "accel_shear", "accel_turn", "lever", "delay", "drift",
 )  # fmt: skip
@@ -74,12 +78,12 @@ class Inertial(Observation):
         """The windows' shapes and tilts are its own."""
 
     def unknowns(self, unknowns: Unknowns) -> None:
-        """Those of the accelerometer only where it was heard, those of the clock where it is another than the lidar's."""
+        """Those of the accelerometer only where it was heard; not a delay that the lidar's rows tell too, and have brought."""
         unit = self._begun()
         names = [*gyro.NAMES, *(accelerometer.NAMES if unit.force_known.any() else ()), "delay", "drift"]
         for name in ORDER:
             key = f"{self.name}.{name}"
-            if name in names and key in PRIORS:
+            if name in names and key in PRIORS and key not in unknowns.names:
                 value = unit.values[name]
                 expected = self.lever_m if name == "lever" else None
                 unknowns.add(key, np.full(len(value), PRIORS[key]), value, expected, UNITS[name])
@@ -150,6 +154,15 @@ def carried_density(observations: Sequence[Observation], otherwise: float) -> fl
         each.unit for each in observations if isinstance(each, Inertial) and each.carries and each.unit is not None
     )
     return next((float(unit.sigma_turn_rad / np.sqrt(H)) for unit in units), otherwise)
+
+
+def retiming_of(observations: Sequence[Observation], carried_by: str) -> Retiming | None:
+    """The delay of the gyro by which an odometry went; None where no unit of an adjustment is that."""
+    for each in observations:
+        if isinstance(each, Inertial) and each.carries and each.track.name == carried_by:
+            key = f"{each.name}.delay"
+            return Retiming(key, PRIORS[key], each.track)
+    return None
 
 
 def of_run(flown: Flown) -> list[Observation]:

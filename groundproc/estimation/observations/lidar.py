@@ -16,6 +16,7 @@ from flightlog import frames
 from groundproc.estimation.observations import lasers, spin
 from groundproc.estimation.observations.observation import Observation, Outcome, State
 from groundproc.estimation.observations.planes import Rows, rows_of
+from groundproc.estimation.observations.retiming import Retiming
 from groundproc.estimation.observations.rows import Factor, Unknowns
 from groundproc.estimation.observations.spin import Spin
 from groundproc.estimation.odometry.clusters import Clusters
@@ -46,26 +47,32 @@ class Lidar(Observation):
         Of the lasers, so far; they stay 0 where the clusters have none.
     spin : Spin or None
         The rotor and its line, where the lidar's own gyro carries the motion.
+    retiming : Retiming or None
+        How late the gyro is that carries the motion.
     """
 
     clusters: Clusters
     corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
     spin: Spin | None = None
+    retiming: Retiming | None = None
     name: str = "lidar planes"
 
     def unknowns(self, unknowns: Unknowns) -> None:
-        """Offsets of the lasers where they are asked for, and the line of the spin; they have to follow the path."""
+        """Offsets of the lasers where they are asked for, the delay of the gyro, the line of the spin; they have to follow the path."""
         if self.clusters.laser is not None:
             count = len(lasers.NAMES)
             priors, values = np.split(lasers.PRIOR, count), np.split(self.corrections, count)
             for name, prior, value in zip(lasers.NAMES, priors, values, strict=True):
                 unknowns.add(name, prior, value)
+        if self.retiming is not None:
+            self.retiming.unknowns(unknowns)
         if self.spin is not None:
             self.spin.unknowns(unknowns)
 
     def rows(self, path: Path, voxel_m: float, cut: bool) -> Rows:
         """Distances from planes, linear about a path; voxels have edges of `voxel_m`, outliers are `cut` or only weigh less."""
-        return rows_of(self.clusters, path, voxel_m, MOST, cut, MOST_FILLED, self.spin is not None)
+        turning = None if self.retiming is None else self.retiming.turning(path)
+        return rows_of(self.clusters, path, voxel_m, MOST, cut, MOST_FILLED, self.spin is not None, turning)
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """What is known of the line of the spin; all else is in `rows`."""
@@ -73,8 +80,10 @@ class Lidar(Observation):
         return [] if self.spin is None else self.spin.factors(unknowns)
 
     def take(self, part: Mapping[str, Array], path: Path) -> None:
-        """Shift what each laser saw, and know the line."""
+        """Shift what each laser saw, and know the delay and the line."""
         del path
+        if self.retiming is not None:
+            self.retiming.take(part)
         if self.spin is not None:
             self.spin.take(part)
         if self.clusters.laser is not None:
@@ -83,7 +92,9 @@ class Lidar(Observation):
             self.corrections = self.corrections + offsets
 
     def turned(self, path: Path, part: Mapping[str, Array]) -> Path:
-        """A path turned by what a solution found of the line."""
+        """A path turned by what a solution found of the gyro's delay and of the line."""
+        if self.retiming is not None:
+            path = self.retiming.retimed(path, part)
         if self.spin is None:
             return path
         turn = frames.quat_exp(self.spin.turns(part[spin.NAME]))

@@ -9,6 +9,7 @@ from numba import njit
 
 from groundproc.estimation.observations.filled import filled_rows
 from groundproc.estimation.observations.lasers import UNKNOWNS, LaserColumns, border_of, columns_of
+from groundproc.estimation.observations.retiming import RetimingColumn, retiming_column
 from groundproc.estimation.observations.spin import SpinColumns, spin_columns
 from groundproc.estimation.observations.told import Poses, keep_told
 from groundproc.estimation.odometry.clusters import Clusters
@@ -31,14 +32,16 @@ RANGE_SIGMA_M: Final = 0.02
 ROUGHNESS_M: Final = 0.006
 """Roughness of a surface before its residuals tell, one sigma of a cluster [m]."""
 
+Columns = LaserColumns | RetimingColumn | SpinColumns
+
 
 @dataclass(slots=True)
 class Rows(PlaneRows):
-    """Rows of a path, with the corrections of the lasers and the line of the spin as further unknowns where they are asked for.
+    """Rows of a path; corrections of the lasers, the delay of its gyro and the line of the spin are further unknowns where asked for.
 
     Attributes
     ----------
-    more : list of LaserColumns or SpinColumns
+    more : list of Columns
         By further unknowns, which follow those of the path.
     border : ndarray, shape (further, path)
         Normal matrix between them and the path, planes solved for within.
@@ -46,7 +49,7 @@ class Rows(PlaneRows):
         The same of them alone.
     """
 
-    more: "list[LaserColumns | SpinColumns]" = field(default_factory=list)
+    more: "list[Columns]" = field(default_factory=list)
     border: Array = field(default_factory=lambda: np.zeros((0, 0)))
     corner: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -93,14 +96,20 @@ class Rows(PlaneRows):
         border_of(self.arrays, lasers.arrays, border, corner)
         self.more, self.border, self.corner = [lasers], border, corner
 
+    def with_retiming(self, turning: Array, time_ns: Ints, path: Path) -> None:
+        """Take the delay of the gyro in, after the lasers: what the path turns by for it, and the times of each row's cluster."""
+        self._with(retiming_column(self.jacobian, turning, time_ns, path))
+
     def with_spin(self, xyz_m: Singles) -> None:
-        """Take the line of the spin in, after the lasers': each row's cluster in the sensor frame."""
-        spin, path = spin_columns(self.jacobian, xyz_m), self.path_size
-        self.more = [*self.more, spin]
-        products = np.array([self.spread(spin.column(number)) for number in range(spin.UNKNOWNS)])
-        before = len(self.corner)
+        """Take the line of the spin in, after these: each row's cluster in the sensor frame."""
+        self._with(spin_columns(self.jacobian, xyz_m))
+
+    def _with(self, columns: "RetimingColumn | SpinColumns") -> None:
+        path, before = self.path_size, len(self.corner)
+        self.more = [*self.more, columns]
+        products = np.array([self.spread(columns.column(number)) for number in range(columns.UNKNOWNS)])
         self.border = np.concatenate([self.border.reshape(-1, path), products[:, :path]])
-        corner = np.zeros((before + spin.UNKNOWNS, before + spin.UNKNOWNS))
+        corner = np.zeros((before + columns.UNKNOWNS, before + columns.UNKNOWNS))
         corner[:before, :before], corner[before:] = self.corner, products[:, path:]
         corner[:before, before:] = corner[before:, :before].T
         self.corner = corner
@@ -110,8 +119,8 @@ class Rows(PlaneRows):
 
 
 def rows_of(
-    clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool, filled: int = 0, spin: bool = False
-) -> Rows:
+    clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool, filled: int = 0, spin: bool = False, turning: Array | None = None,
+) -> Rows:  # fmt: skip
     """Put clusters into voxels where the path places them, find the planes and what fills its voxel instead, and linearise.
 
     Parameters
@@ -127,6 +136,8 @@ def rows_of(
         Clusters of a slice on what fills its voxel that are used.
     spin : bool
         Whether the line of the spin is an unknown.
+    turning : ndarray, shape (grid, 3), optional
+        What the path turns by for a second of its gyro's delay, where that is an unknown.
     """
     world, rotation, knot, weights = _place_all(clusters, path)
     voxel, voxels = assign(world, voxel_m)
@@ -160,6 +171,8 @@ def rows_of(
     if clusters.laser is not None:
         in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
         rows.with_lasers(clusters.laser[kept], xyz, in_sensor)
+    if turning is not None:
+        rows.with_retiming(turning, clusters.time_ns[kept], path)
     if spin:
         rows.with_spin(xyz)
     return rows
