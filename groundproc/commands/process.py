@@ -215,6 +215,8 @@ def _print_states(found: Sequence[State], folder: Path, as_json: bool) -> None:
 
 def _report(quality: dict[str, Any], folder: Path) -> list[tuple[str, str]]:
     """A few lines for the terminal, each with what it is about."""
+    from groundproc.reporting.delays import delays
+
     sync, points, track = quality["sync"], quality["points"], quality["trajectory"]
     crs, height = quality["crs"], quality["height"]
     east, north, up = track["median_sigma_m"]
@@ -233,6 +235,7 @@ def _report(quality: dict[str, Any], folder: Path) -> list[tuple[str, str]]:
             + (f"; {sync['note']}" if sync["note"] else ""),
         ),
     ]
+    lines += [("clocks", said) for said in (delays(quality),) if said]
     mended = dict.fromkeys(f"UTC: {said}" for leg in quality["legs"] for said in leg["utc"]["mended"])
     lines += [("", line) for line in mended]
     lines += [("control", line) for line in _control_lines(quality.get(track["method"], {}).get("control"))]

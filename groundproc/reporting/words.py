@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from groundproc.reporting.delays import delays
 from groundproc.reporting.markup import Html, section, table, tag
 from groundproc.verdict import BAD, DOUBTFUL, GOOD, Verdict, warnings_in
 
@@ -165,7 +166,10 @@ def clocks(quality: Quality) -> Html:
             )
         )  # fmt: skip
     head = ("", "Tied by", "Offset", "Sigma", "Drift", "Peak", "Next peak", "Residual", "Samples", "UTC from")
-    return section("clocks", "Clocks", table(head, rows, "numbers"))
+    said = delays(quality)
+    return section(
+        "clocks", "Clocks", table(head, rows, "numbers"), *([tag("p", f"{said[0].upper()}{said[1:]}.")] if said else [])
+    )
 
 
 def control(quality: Quality) -> Html:

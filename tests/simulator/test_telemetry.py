@@ -97,6 +97,24 @@ def test_gyros_read_the_true_motion_on_the_axes_of_the_manual(clean, attitudes, 
     assert np.abs(sensor[inside] - expected).max() < 0.049 + 0.007 + 0.0005
 
 
+def test_late_readings_are_those_of_before(simulate):
+    """5 ms late: as a flight without delay has them at the moment 5 ms before; the two draw the same times of packets."""
+    options = dark(perfect(Options()))
+    late = replace(options, gyros=replace(options.gyros, delay_s=0.005))
+    prompt, delayed = (simulate("field", 4.0, each) for each in (options, late))
+    assert delayed.truth["lidar_imu_delay_s"] == 0.005
+    assert prompt.truth["lidar_imu_delay_s"] == 0.0
+    (time_s, reading), (_, older) = (
+        (stamps_us(each.capture.payloads(512)) * 1e-6, values_of(each.capture.payloads(512))[:, [0, 2, 4, 8]])
+        for each in (prompt, delayed)
+    )
+    inside = slice(10, None)
+    at = np.stack([np.interp(time_s[inside] - 0.005, time_s, axis) for axis in reading.T], axis=1)
+    # lines between readings up to 10 ms apart, of wander up to 3 Hz and 40 deg/s: w^2 r dt^2 / 8 = 0.18 deg/s or 2 steps; rounding on top
+    assert np.abs(older[inside] - at).max() <= 4.0
+    assert np.abs(older[inside] - reading[inside]).max() > 8.0
+
+
 def test_accelerometers_at_rest_read_the_pull_of_gravity_on_their_axes(simulate):
     still = simulate("panels", 1.0, dark(perfect(Options())))
     accel_g = values_of(still.capture.payloads(512))[:, [2, 3, 6, 7, 10, 11]].mean(axis=0) * 0.001221
