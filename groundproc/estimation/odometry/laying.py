@@ -106,7 +106,7 @@ class Target:
             change = _array(-np.linalg.solve(information + np.diag(WEAK), rows.T @ (weight * off)))
             mat, shift = _array(_matrix(change[:3]) @ mat), shift + change[3:]
         covariance = _array(np.linalg.inv(information / INFLATION + 1e-6 * np.eye(6)))
-        on, known = self._agreement(Surfaces(arm @ mat.T + about_m + shift, mine.normal @ mat.T, mine.kind))
+        on, known = self.agreement(Surfaces(arm @ mat.T + about_m + shift, mine.normal @ mat.T, mine.kind))
         return Laid(about_m, mat, shift, covariance, on, known)
 
     def _rows(self, moved: Surfaces, about_m: Array, gate_m: float) -> tuple[Array, Array, Array]:
@@ -145,7 +145,7 @@ class Target:
         along = along * np.sign(along @ self._up)[:, None]
         return [(np.broadcast_to(self._up, between.shape), (along * between).sum(axis=1))]
 
-    def _agreement(self, moved: Surfaces) -> tuple[Flags, Flags]:
+    def agreement(self, moved: Surfaces) -> tuple[Flags, Flags]:
         """Which points of what stands lie on their like, and which could."""
         on, known = np.zeros(len(moved), np.bool_), np.zeros(len(moved), np.bool_)
         own, nearest = self._met(moved, STANDING, BESIDE_VOXEL_M)
