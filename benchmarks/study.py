@@ -126,6 +126,7 @@ TRIALS: Final = (
     Trial("fix after take-off", "survey_fast_gyro", 11, 24.0, changes="faults: {gnss_from_s: 8}"),
     Trial("RTK, floats for a while", "survey_fast_gyro", 11, 24.0, changes=FLOAT),
     Trial("offset for half a minute", "survey_fast_gyro", 11, 60.0, changes=OFFSET),
+    *(Trial(f"lidar's gyros {late} ms late", "survey_fast_gyro", 91, 24.0, changes=AIR[:-1] + f", delay_s: {late / 1e3}}}") for late in (3, -5)),
     Trial("autopilot 20 ms late", "survey_slow_gyro", 51, changes="ins: {gyro_delay_s: 0.02, position_delay_s: 0.2}"),
 )  # fmt: skip
 
@@ -231,6 +232,10 @@ def _estimates(found: Mapping[str, Any], estimated: Mapping[str, Any], truth: Ma
         delay = estimated["ins.delay_s"]
         error_ms = tie["offset_error_ms"] + delay["value"][0] * 1e3
         figures |= {"offset_error_ms": error_ms, "delay_z": abs(error_ms) / (delay["sigma"][0] * 1e3)}
+    if "lidar.delay_s" in estimated:
+        late = estimated["lidar.delay_s"]
+        error_ms = (late["value"][0] - truth.get("lidar_imu_delay_s", 0.0)) * 1e3
+        figures |= {"lidar_delay_error_ms": error_ms, "lidar_delay_z": abs(error_ms) / (late["sigma"][0] * 1e3)}
     ratios = []
     for unit, matrix, turn in (
         ("ins", truth["ins_gyro_matrix"], mat.T),
