@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from groundproc.assessment.targets import Wanted
 
 Progress = Callable[[str, int], None]
-HELP = "hold a cloud against surveyed points, or two sets of coordinates against each other"
+HELP = "compare a cloud with surveyed points, or two sets of coordinates with each other"
 USAGE = "expected swath assess CLOUD --points CSV [--mode MODE], CLOUD --reference CLOUD, CLOUD --strips, or swath assess --pairs CSV"
 
 
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="two sets of coordinates by id: columns id, then x, y, z of each, reference first",
     )
     parser.add_argument(
-        "--reference", type=Path, metavar="CLOUD", help="another cloud of the same place, which is taken for the truth"
+        "--reference", type=Path, metavar="CLOUD", help="another cloud of the same place, taken as the truth"
     )
     parser.add_argument("--register", action="store_true", help="with --reference: lay the cloud on it first")
     parser.add_argument(

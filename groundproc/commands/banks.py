@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--terrain", choices=list(PRESETS), default="auto", help="what the land is like; default: auto")
     parser.add_argument(
         "--stretch", type=float, default=STRETCH_M, metavar="M",
-        help=f"with --before: length of what retreat and volume are told of [m]; default: {STRETCH_M:g}",
+        help=f"with --before: length of a stretch, for which retreat and volume are given [m]; default: {STRETCH_M:g}",
     )  # fmt: skip
     parser.add_argument(
         "--most-retreat", type=float, default=MOST_RETREAT_M, metavar="M",

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-HELP = "tell what moved during a flight: time, place and speed of people, cars and others, with sigmas"
+HELP = "list what moved during a flight: time, place and speed of people, cars and others, with sigmas"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

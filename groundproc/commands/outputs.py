@@ -13,7 +13,7 @@ _OCTREE: Final = ".copc.laz"
 
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Declare the one option by which what is there is written over."""
-    parser.add_argument("--force", action="store_true", help="write over files that are there")
+    parser.add_argument("--force", action="store_true", help="overwrite existing files")
 
 
 def claim_file(path: Path, suffixes: Sequence[str], force: bool, inputs: Iterable[Path] = ()) -> None:

@@ -14,9 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--height", type=float, required=True, metavar="M", help="above the ground [m]")
     parser.add_argument("--speed", type=float, required=True, metavar="M/S", help="over the ground [m/s]")
     lines = parser.add_mutually_exclusive_group()
-    lines.add_argument(
-        "--density", type=float, metavar="N", help="points a square metre that there are to be everywhere"
-    )
+    lines.add_argument("--density", type=float, metavar="N", help="least number of points a square metre, anywhere")
     lines.add_argument("--spacing", type=float, metavar="M", help="distance of the lines [m]")
     lines.add_argument("--overlap", type=float, metavar="SHARE", help="of neighbouring strips, 0 to 0.95; default: 0.5")
     parser.add_argument("--heading", type=float, metavar="DEG", help="of the lines; default: along the longer side")

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="say what is there and what is to be done, and why; do nothing",
     )
-    parser.add_argument("--force", action="store_true", help="do every step again, and write over files that are there")
+    parser.add_argument("--force", action="store_true", help="do every step again, and overwrite existing files")
     parser.add_argument("--json", action="store_true", help="print what quality.json holds")
 
 

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--intensity", metavar="KIND",
         help="compensated (for the range, by the sensor), amplitude, amplitude-db or decibel (reflectance in dB); "
-        "default: recognised, and said",
+        "default: recognised, and reported",
     )  # fmt: skip
     parser.add_argument(
         "--lever", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("RIGHT", "FORWARD", "UP"),

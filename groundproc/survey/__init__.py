@@ -246,7 +246,7 @@ class ImageSettings:
         words=("--panels",),
         metavar="CSV",
         reads="file",
-        absent="the irradiance that pictures state, else the index is said not to be calibrated",
+        absent="the irradiance that pictures state, else the index is reported as not calibrated",
         in_file=BESIDE,
     )
     ortho_gsd_m: float = setting(
