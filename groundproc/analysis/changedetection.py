@@ -1,10 +1,12 @@
 """What appeared or vanished between two epochs, in a piece of ground.
 
-A point is explained by the other epoch if it lies on a surface of it, by the roughness of that surface and the registration, or near to
-leaves of it, which sway. Points that are not, by themselves or together with those around them (`changewindows`), make clusters. A cluster
-counts if chance has not put it together, by the number of sets of points that could have come out as unlikely. It is a claim if the other
-epoch had to have seen several points of it, by its own density there or by its own beams that went through, and did look past it on every
-side: else it is unseen, which is no change. Beams pass in front of a wall that they do not show; behind it, where it stands, none does.
+A point is explained by the other epoch if it lies on a surface there, within that surface's roughness and the
+registration's sigma, or near leaves there, which sway. Points that are not explained, by themselves or together with
+those around them (`changewindows`), form clusters. A cluster counts if chance cannot have put it together, given the
+number of sets of points that could have come out as unlikely. It is a claim if the other epoch had to have seen
+several points of it, by its own density there or by its own beams that went through, and did look past it on every
+side. Otherwise it is unseen, which is no change. The sides matter because beams pass in front of a wall that they do
+not show; behind it, where it stands, none passes.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
-"""How places moved between two epochs, as vectors in space: patches of the earlier cloud, each laid on by the later one (`registration`).
+"""How places moved between two epochs, as vectors in space: patches of the later cloud laid on the earlier one.
 
-A distance along a normal says nothing of ground that slides along itself. A patch with relief holds in all three directions: the later
-points of it are laid on the earlier ones with a shift and a turn of their own. Where relief is lacking, the prior of a metre is left, and
-the sigma says so. Memory: a square of a million points.
+A distance along a normal says nothing about ground that slides along itself. A patch with relief is determined in all
+three directions: its later points are laid on the earlier ones with a shift and a rotation of their own
+(`registration`). Without relief, the prior of a metre is left, and the sigma says so. Memory: a square of a million
+points.
 """
 
 import warnings as python_warnings

@@ -1,8 +1,9 @@
 """Rasters of other sensors draped over a cloud: temperatures, bands, and materials by their spectra.
 
-A raster shows what is uppermost. So a point takes its value only where it is near the top of its cell; what lies under a crown or a roof
-keeps none, unless all are asked for. The cloud is read for the tops, square by square for the values, and to be written anew. Memory: 4
-bytes for each cell, and a square of a million points with the raster there.
+A raster shows what is uppermost. So a point takes its value only if it is near the top of its cell; what lies under a
+crown or a roof gets none, unless all points are asked for. The cloud is read three times: for the tops, square by
+square for the values, and to be written anew. Memory: 4 bytes for each cell, and a square of a million points with the
+raster there.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,9 +1,9 @@
-"""What is indoors where no beam is known: behind a wall whose other side lies open, under something, and within the other walls.
+"""What is indoors where no beam is known: behind an outer wall, under something, and within the other outer walls.
 
-A wall of a house is an outer one where what lies before it, on one side, is lower than its middle: ground, or the roof of a garage. Behind
-it, straight as seen from there, lie rooms, but also the roof, the other walls and the yard beyond the house, all measured from elsewhere.
-Roofs are what nothing lies above; where no roof was seen at all, as from a car, this cannot be asked. The yard is beyond another outer
-wall.
+A wall of a house is an outer one if what lies before it, on one side, is lower than its middle: ground, or the roof of
+a garage. Straight behind it, as seen from there, lie rooms, but also the roof, the other walls and the yard beyond the
+house, all measured from elsewhere. Roofs are recognised because nothing lies above them; if no roof was seen at all,
+as from a car, this test is left out. The yard lies beyond another outer wall.
 """
 
 from collections.abc import Sequence

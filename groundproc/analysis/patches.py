@@ -1,9 +1,9 @@
-"""Patches of ground that stand out against what is around them, by height and by what strength the echoes have.
+"""Patches of ground that stand out against their surroundings, by height and by the strength of the echoes.
 
-Mean heights of cells are held against the plane that fits them best within two metres; what is left is averaged over a patch of the size
-that is looked for. How much that scatters where nothing is, with noise, stones and tufts in it, is told by the ground itself: the median
-of its absolute values around. So a patch is judged by how unusual it is for this ground. A step in reflectance adds to the odds; alone it
-is no claim.
+Mean heights of cells are compared with the plane that fits them best within two metres. The residuals are averaged
+over a patch of the wanted size. How much such averages scatter where there is nothing, with noise, stones and tufts
+included, is measured on the ground around: the median of their absolute values. So a patch is judged by how unusual it
+is for this ground. A step in reflectance adds to the odds; alone it is no claim.
 """
 
 from dataclasses import dataclass

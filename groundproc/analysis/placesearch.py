@@ -1,9 +1,9 @@
-"""Where a cloud lies on another when neither its place nor its heading is known: both stand upright, and that is all.
+"""Where a cloud lies on another when neither its place nor its heading is known; both only have to stand upright.
 
-Tops of cells, freed of what is wider than some cells, are compared for every heading and every shift by their correlation over the
-cells that both have (masked correlation by Fourier transforms, Padfield 2012). What that can be by chance follows from how many
-independent places the common area holds: cells next to each other are not. A correlation that is no chance at one place and nowhere else
-is an answer; at two places, it is none.
+The tops of cells, without objects wider than some cells, are compared for every heading and every shift, by their
+correlation over the cells that both have (masked correlation by Fourier transforms, Padfield 2012). How large that can
+be by chance follows from the number of independent places in the common area; neighbouring cells are not independent.
+A correlation that chance cannot explain at one place, and nowhere else, is an answer; at two places, it is none.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
-"""A cloud against another of the same place: what it is off by along the normals of the other, as a whole and from place to place.
+"""A cloud compared with another of the same place: distances along the other's normals, as a whole and place by place.
 
-Around points of the reference stand cylinders along its normals; the distance is that of the means of both clouds in them (M3C2,
-`deformation.m3c2`). What all distances say together is one shift, by weighted least squares of their normals, whose covariance is of groups
-of four metres, as neighbours share what they are off by. Optionally the cloud is laid on the reference first; then what that took is told,
-and what is left carries the covariance of it.
+Cylinders stand around points of the reference along its normals; the distance is that between the means of both clouds
+in them (M3C2, `deformation.m3c2`). All distances together give one shift, by weighted least squares along their
+normals. Its covariance is that of groups of four metres, because neighbours share their errors. Optionally the cloud
+is laid on the reference first. Then that motion is reported, and the remaining distances carry its covariance.
 """
 
 import tempfile

@@ -1,11 +1,12 @@
 """One cloud laid on another: six numbers and their covariance, or why not.
 
-Both clouds are smoothed: their points are put on the plane of the patch around (`numerics.normals`). Those of B are held against the planes
-of those of A that they are next to (Chen and Medioni 1992), from far to near, with weights by Cauchy, so that what has changed does not
-pull, and by how well patches of their roughness repeat: leaves sway. Planes cut off crests and fill hollows; as both are smoothed alike
-that does not pull either. The covariance is of groups of residuals within four metres, which share their patches, each judged by all
-others, for one bush may tell all there is of a direction. What normals tell by their own errors is no information. A direction that no
-plane tells stays as it was.
+Both clouds are smoothed: their points are put on the plane of the patch around them (`numerics.normals`). Points of B
+are matched to the planes of the nearest points of A (Chen and Medioni 1992), from far to near. Cauchy weights keep
+changes from pulling, and each point is weighted by how well patches of its roughness repeat, because leaves sway.
+Planes cut off crests and fill hollows; as both clouds are smoothed alike, that does not pull either. The covariance
+comes from groups of residuals within four metres, which share their patches. Each group is judged by all others,
+because one bush may hold all the information on a direction. What normals tell by their own errors is no information.
+A direction that no plane determines stays as it was.
 """
 
 from dataclasses import dataclass, replace

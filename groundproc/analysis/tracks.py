@@ -1,9 +1,9 @@
-"""Things that move, from the points of them: what a revolution sees of one, and how these follow each other.
+"""Things that move, from their points: what a revolution sees of one, and how these sightings follow each other.
 
-A revolution meets a thing in one burst of a few hundredths of a second. Its points, joined in space and time, give a place; places that
-one speed carries on make a track. Speed is the slope of a line through the places of a second and a half. What is seen of a thing changes
-as it passes, and the middle of that with it: its sigma has the scatter about the line, and half of the thing's size over the time for which
-it was seen.
+A revolution meets a thing in one burst of a few hundredths of a second. Its points, joined in space and time, give a
+place; places that one speed connects make a track. Speed is the slope of a line through the places of a second and a
+half. The part of a thing that is seen changes as it passes, and with it the middle. The sigma therefore includes the
+scatter about the line, and half of the thing's size over the time for which it was seen.
 """
 
 from dataclasses import dataclass

@@ -1,11 +1,11 @@
-"""From a cloud to what is seen through windows: points behind the walls of houses whose beams went through an opening.
+"""From a cloud to what is seen through windows: points behind walls of houses whose beams went through an opening.
 
-A point belongs to a window when its beam crossed a wall within that wall's own outline. Where beams are not known, what is indoors counts
-(`indoors`). Points are never taken away and are no noise: behind
-a pane only a few beams in a hundred come back, and lie alone.
+A point belongs to a window if its beam crossed a wall within that wall's own outline. Where beams are not known,
+points that are indoors count (`indoors`). Points are never removed and are no noise: behind a pane only a few beams in
+a hundred come back, and their points are isolated.
 
-The cloud is read for its ground (see `terrain.floor`), for squares of ground with all around them, and to be written anew. Memory: that of
-the ground and a square of a million points.
+The cloud is read three times: for its ground (see `terrain.floor`), for squares of ground with all around them, and to
+be written anew. Memory: that of the ground and a square of a million points.
 """
 
 from collections.abc import Callable, Sequence

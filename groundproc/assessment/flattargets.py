@@ -1,8 +1,9 @@
 """Targets painted on something flat: a checkerboard of four squares, a cross, a disc.
 
-Planes near the surveyed point are looked at one after the other, the largest first, so that a panel that leans on the ground is seen in
-its own plane. On each, patterns are searched for and fitted. One is a target only if it explains most of what the points show, each of
-its parts is there and bright or dark as it should be, and nothing that is painted on roads explains the same as well.
+Planes near the surveyed point are examined one after the other, the largest first, so that a panel that leans on the
+ground is seen in its own plane. On each, patterns are searched for and fitted. A pattern is accepted as a target only
+if it explains most of what the points show, if each of its parts is there and as bright or dark as it should be, and
+if nothing that is painted on roads explains the same as well.
 """
 
 from dataclasses import dataclass, replace

@@ -1,8 +1,9 @@
 """A pattern fitted to intensities by weighted least squares, and how well it explains them.
 
-Noise grows with brightness (of a lidar it is a share of the strength), so the variance goes linearly from dark to bright, as the residuals
-of a first fit have it. Edges that lie between points make the sum of squares rough, so the centre and its covariance are the mean and the
-second moments of the posterior, by importance sampling about the least squares (Geweke 1989), and not its curvature alone.
+Noise grows with brightness (for a lidar it is a share of the strength). The variance is therefore taken as linear from
+dark to bright, from the residuals of a first fit. Edges that lie between points make the sum of squares rough. So the
+centre and its covariance are the mean and the second moments of the posterior, by importance sampling about the
+least-squares solution (Geweke 1989), and not its curvature alone.
 """
 
 from collections.abc import Callable

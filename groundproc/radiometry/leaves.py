@@ -1,9 +1,10 @@
-"""How echoes from no surface depend on the direction that they are seen from, as strips that overlap tell it.
+"""How echoes from no surface depend on the viewing direction, as overlapping strips reveal it.
 
-The incidence on a leaf, a needle or a twig is not known. As a layer they are darker or brighter when they are seen at a slant, by how the
-leaves hang: not at all where they hang anyhow, as the cosine of the angle from the vertical where they lie flat, the other way where they
-stand. One exponent of this cosine is fitted for a flight, to the means of cells that several strips saw at different angles. What the
-strips differ by as a whole is left out, so that a strip that is brighter everywhere tells nothing.
+The incidence on a leaf, a needle or a twig is not known. But as a layer they are darker or brighter when seen at a
+slant, depending on how the leaves hang. If they hang at random, the angle has no effect; if they lie flat, the effect
+is that of the cosine of the angle from the vertical; if they stand upright, it is the opposite. One exponent of this
+cosine is fitted for a flight, to the means of cells that several strips saw at different angles. Differences of whole
+strips are left out, so that a strip that is brighter everywhere tells nothing.
 """
 
 from dataclasses import dataclass

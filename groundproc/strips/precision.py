@@ -1,8 +1,8 @@
-"""How well the strips of a cloud agree: the thickness of planes within each strip, and what strips differ by.
+"""How well the strips of a cloud agree: the thickness of planes within each strip, and the distances between strips.
 
-A cloud is cut into voxels. Of each strip's points in a voxel that form a plane, the scatter across it is the precision within a strip:
-noise of the ranges, and poses that wander while the strip passes. The way between the planes of two strips is the precision between
-strips. All strips together are as thick as both make them.
+A cloud is cut into voxels. If one strip's points in a voxel form a plane, their scatter across it is the precision
+within a strip: noise of the ranges, and poses that wander while the strip passes. The distance between the planes of
+two strips is the precision between strips. All strips together are as thick as both effects make them.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
-"""Covariance of poses: what the errors of one pose have to do with each other.
+"""Covariance of poses: the correlation of the errors of one pose.
 
-The state is (east, north, up [m], roll, pitch, heading [rad]), in this order; its frame is the trajectory's local frame. The roots of
-the diagonal are therefore the sigmas of the trajectory. A trajectory keeps its sigmas at every knot and the correlations, which change
-slowly, at coarser knots. Between these both are interpolated linearly, C(t) = D(t) R(t) D(t): a mean of correlation matrices is one, so
-every matrix that comes out is positive semi-definite.
+The state is (east, north, up [m], roll, pitch, heading [rad]), in this order; its frame is the trajectory's local
+frame. The roots of the diagonal are therefore the sigmas of the trajectory. A trajectory keeps its sigmas at every
+knot, and the correlations, which change slowly, at coarser knots. In between, both are interpolated linearly, C(t) =
+D(t) R(t) D(t). A mean of correlation matrices is a correlation matrix, so every result is positive semi-definite.
 """
 
 from collections.abc import Sequence

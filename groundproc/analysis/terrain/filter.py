@@ -1,10 +1,11 @@
 """Which of the lowest points of cells are ground.
 
-Progressive morphological openings (Zhang et al. 2003) with a threshold that grows with the radius, as in the simple morphological filter
-(Pingel et al. 2013), and three changes. What lies far too low is taken out and filled before anything is opened. Openings work on heights
-above the ground that a first run found, smoothed over some metres: a slope is level for them, and an object on it stands out as it would
-on a plain. And the threshold follows the ground's own relief at each place, its deviation from its smoothed self and its slope: in a
-quarry an edge of a metre is ground, on a lawn it is none.
+Progressive morphological openings (Zhang et al. 2003) with a threshold that grows with the radius, as in the simple
+morphological filter (Pingel et al. 2013), with three changes. Points that lie far too low are removed and filled
+before anything is opened. Openings work on heights above the ground that a first run found, smoothed over some metres:
+for them a slope is level, and an object on it stands out as it would on a plain. And the threshold follows the
+ground's own relief at each place, its slope and its deviation from its smoothed self: in a quarry an edge of a metre
+is ground, on a lawn it is not.
 """
 
 from collections.abc import Iterator

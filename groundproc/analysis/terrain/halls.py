@@ -1,8 +1,9 @@
 """Buildings wider than the openings: smooth pieces of what passed for ground that end in a wall all around.
 
-A spur, a bank or a plateau is as wide as a hall, but goes down to its surroundings in a slope somewhere, goes on to the edge of the cloud,
-or has ground above it on one side. So a wider opening takes them all (see the blind alleys), and the rim alone takes the edges of quarries
-among small things; only of pieces that no opening has reached does a rim without a gap tell.
+A spur, a bank or a plateau is as wide as a hall. But it goes down to its surroundings in a slope somewhere, reaches
+the edge of the cloud, or has ground above it on one side. A wider opening would take all of these (see the blind
+alleys). The rim alone, tried on small pieces, would take the edges of quarries. Only on pieces that no opening has
+reached is a rim without a gap a proof.
 """
 
 from typing import Any, Final
