@@ -1,7 +1,7 @@
 """The stage that makes the cloud: every shot given its pose, placed, projected and handed on; and what became of each."""
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -43,6 +43,33 @@ class Sink(Protocol):
 
     def finish(self) -> None:
         """All points were given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Then:
+    """A sink, and what is done when it is finished.
+
+    Attributes
+    ----------
+    sink : Sink
+    after : callable
+    """
+
+    sink: Sink
+    after: Callable[[], None]
+
+    def begin(self) -> None:
+        """Get the sink ready."""
+        self.sink.begin()
+
+    def add(self, points: Points) -> None:
+        """Hand it points."""
+        self.sink.add(points)
+
+    def finish(self) -> None:
+        """Finish it, and go on."""
+        self.sink.finish()
+        self.after()
 
 
 def placed(shots: Iterable[Shots], trajectory: Trajectory, mount: Mount) -> Iterator[Points]:

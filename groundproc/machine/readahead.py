@@ -5,6 +5,7 @@ compressing.
 """
 
 import contextlib
+import importlib
 import queue
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -129,3 +130,19 @@ def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     made: list[T] = []
     beside([lambda: made.append(first()), lambda: found.append(second())])
     return made[0], found[0]
+
+
+def imported_meanwhile(modules: Sequence[str]) -> None:
+    """Import modules that will be wanted, by a thread; on one core nothing is gained, and they are imported when they are used.
+
+    What fails is left for then to be told.
+    """
+    if cores() == 1:
+        return
+
+    def load() -> None:
+        with contextlib.suppress(ImportError):
+            for name in modules:
+                importlib.import_module(name)
+
+    threading.Thread(target=load, name="imports", daemon=True).start()

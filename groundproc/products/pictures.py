@@ -8,7 +8,8 @@ import numpy.typing as npt
 
 from flightlog.clock import utc_text
 from groundproc.cloud.points import Points
-from groundproc.products.plan import Plan, draw_plan
+from groundproc.machine.readahead import imported_meanwhile
+from groundproc.products.plan import DRAWN_WITH, Plan, draw_plan
 from groundproc.products.product import Context
 from groundproc.raster.cells import Cells
 from groundproc.vectors.tracks import pieces
@@ -57,6 +58,7 @@ class Pictures:
         """Begin with no points."""
         self._context, self._sample = context, CloudSample()
         self._cells, self._total = Cells(_CELL_M, {"count"}), 0
+        imported_meanwhile(DRAWN_WITH)  # it takes half a second, while kernels and compression leave the interpreter
 
     def add(self, points: Points) -> None:
         """Keep some of the points."""

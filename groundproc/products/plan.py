@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
+DRAWN_WITH: Final = ("matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.patheffects")
+"""What is imported when a plan is drawn."""
 PIXELS: Final = 600
 _BACK: Final = "#10131a"
 _EDGE: Final = (0.3, 99.7)

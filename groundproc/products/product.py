@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pyproj
 
@@ -18,6 +18,9 @@ from groundproc.products import Chosen
 from groundproc.raster.layers import Layers
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
+
+if TYPE_CHECKING:
+    from groundproc.reporting.cloudpart import Foreseen
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,8 @@ class Context:
         What makes it.
     layers : Layers
         Rasters made in the same pass.
+    foreseen : Foreseen, optional
+        What the report will ask of the cloud, read while others were finished.
     kept : contextlib.ExitStack
         Of this product alone: what is entered here is left when the product is finished, or has failed.
     """
@@ -59,6 +64,7 @@ class Context:
     inputs: tuple[str, ...] = ()
     software: str = f"swath {__version__}"
     layers: Layers = field(default_factory=Layers)
+    foreseen: "Foreseen | None" = None
     kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property

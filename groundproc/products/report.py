@@ -34,5 +34,5 @@ def write(context: Context, options: Options) -> None:
     paths = [context.projection.exact(trajectory.position_m[some]) for some in pieces(trajectory)]
     found = usesfound.read(context.finished)
     subject = Subject(context.finished, context.quality, context.estimate, paths, context.digests, found)
-    text = compose(subject, options.points, int(options.most_mb * 1e6))
+    text = compose(subject, options.points, int(options.most_mb * 1e6), context.foreseen)
     context.aside(FILE).write_text(text, encoding="utf-8")

@@ -2,7 +2,7 @@
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,8 +46,38 @@ class CloudPart:
     crs: Any
 
 
-def read(folder: Path, most: int) -> CloudPart | None:
-    """Some points of the folder's cloud; None where no product holds them.
+@dataclass(frozen=True, slots=True)
+class Foreseen:
+    """What was read of a cloud before a page asks for it.
+
+    Attributes
+    ----------
+    part : CloudPart
+    most : int
+        How many points were asked for.
+    mark : tuple of int
+        Inode, size and time [ns] of the file: they stay when it gets its name, and change with what is in it.
+    """
+
+    part: CloudPart
+    most: int
+    mark: tuple[int, int, int]
+
+
+def foreseen(path: Path, most: int) -> Foreseen:
+    """Some points of a cloud that will be asked for.
+
+    Raises
+    ------
+    CaptureError
+        The cloud is damaged.
+    """
+    mark = _mark(path)
+    return Foreseen(_of(path, most), most, mark)
+
+
+def read(folder: Path, most: int, before: Foreseen | None = None) -> CloudPart | None:
+    """Some points of the folder's cloud, those of `before` where they are the same; None where no product holds them.
 
     Raises
     ------
@@ -57,20 +87,34 @@ def read(folder: Path, most: int) -> CloudPart | None:
     path = next((folder / name for name in CLOUDS if (folder / name).is_file()), None)
     if path is None:
         return None
+    if before is not None and (before.most, before.mark) == (most, _mark(path)):
+        return before.part
+    return _of(path, most)
+
+
+def _of(path: Path, most: int) -> CloudPart:
     cloud = reader.look(path)
     points = thin(cloud, most, in_time=True)
     return CloudPart(points, shades_of(points.columns, _since(points)), cloud.points, cloud.crs)
 
 
-def fitted(part: CloudPart, room_bytes: int) -> tuple[str, CloudPart]:
-    """Points packed as text of at most so many bytes; fewer points where that is needed."""
-    points = part.points
-    while True:
-        packed = _packed(points, part.shades)
-        text = base64.b64encode(packed).decode()
-        if len(text) <= room_bytes or len(points) <= _LEAST_POINTS:
-            return text, CloudPart(points, part.shades, part.total, part.crs)
-        points = thinner(points, max(int(len(points) * _CLOSE * room_bytes / len(text)), _LEAST_POINTS))
+def _mark(path: Path) -> tuple[int, int, int]:
+    found = path.stat()
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def text_of(part: CloudPart) -> str:
+    """All points packed as text."""
+    return base64.b64encode(_packed(part.points, part.shades)).decode()
+
+
+def fitted(part: CloudPart, text: str, room_bytes: int) -> tuple[str, CloudPart]:
+    """Points, packed as a text, as one of at most so many bytes: fewer points where that is needed."""
+    while len(text) > room_bytes and len(part.points) > _LEAST_POINTS:
+        most = max(int(len(part.points) * _CLOSE * room_bytes / len(text)), _LEAST_POINTS)
+        part = replace(part, points=thinner(part.points, most))
+        text = text_of(part)
+    return text, part
 
 
 def _packed(points: Thinned, shades: Sequence[Shade]) -> bytes:

@@ -8,10 +8,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from groundproc.machine.readahead import both
 from groundproc.raster import geotiff
 from groundproc.reporting import cloudpart, imagepart, maps, usesfound, words
 from groundproc.reporting.charts import charts
-from groundproc.reporting.cloudpart import CloudPart
+from groundproc.reporting.cloudpart import CloudPart, Foreseen
 from groundproc.reporting.markup import Html, joined, section, tag
 from groundproc.reporting.plots import draw
 from groundproc.trajectory.estimate import Estimate
@@ -55,20 +56,22 @@ class Subject:
     uses: Sequence[Mapping[str, Any]] = ()
 
 
-def compose(subject: Subject, most_points: int, most_bytes: int) -> str:
-    """The page, of at most so many bytes.
+def compose(subject: Subject, most_points: int, most_bytes: int, foreseen: Foreseen | None = None) -> str:
+    """The page, of at most so many bytes; its cloud may have been read before.
 
     Raises
     ------
     CaptureError
         A product that it shows is damaged.
     """
-    part = cloudpart.read(subject.folder, most_points)
-    before, after = _before(subject, part), _after(subject, part)
-    rest = len(_page(subject, [before, _cloud(subject, part, ""), after]).encode())
-    text = ""
+    part = cloudpart.read(subject.folder, most_points, foreseen)
+    text, (before, after) = both(
+        lambda: "" if part is None else cloudpart.text_of(part),
+        lambda: (_before(subject, part), _after(subject, part)),
+    )
     if part is not None:
-        text, part = cloudpart.fitted(part, most_bytes - rest - _ROOM_BYTES)
+        rest = len(_page(subject, [before, _cloud(subject, part, ""), after]).encode())
+        text, part = cloudpart.fitted(part, text, most_bytes - rest - _ROOM_BYTES)
     return _page(subject, [before, _cloud(subject, part, text), after])
 
 

@@ -21,8 +21,10 @@ from groundproc.flight.lidar import lidar_of
 from groundproc.flight.shots import Tally, shots
 from groundproc.flight.timeline import tied
 from groundproc.geodesy import LocalFrame
+from groundproc.machine.system import cores
 from groundproc.products import chosen, longest_first, plain
-from groundproc.products.product import Context, Making, streamed
+from groundproc.products.product import Context, streamed
+from groundproc.reporting.cloudpart import CLOUDS, foreseen
 from groundproc.sensors.model import Lidar
 from groundproc.sensors.shots import Gate
 from groundproc.steps.ledger import INSIDE
@@ -38,6 +40,8 @@ from groundproc.vectors.features import read_features
 
 FOUND: Final = f"{INSIDE}/place.json"
 """What quality.json says of shots and points."""
+OCTREE, CLOUD = CLOUDS
+REPORT: Final = "report.html"
 
 
 def settings(request: Request) -> Mapping[str, Any]:
@@ -116,13 +120,14 @@ def work(run: Run, folders: Folders) -> None:
     lines = line_begins_ns(made.trajectory, StripOptions().turn_deg)
     scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging, lines)
     with contextlib.ExitStack() as stack:
-        sinks: list[Making] = []
+        sinks: list[placing.Sink] = []
         for each in longest_first(chosen(survey.products)):
             if each.name in folders:
                 own = replace(context, folder=folders[each.name])
                 sinks += stack.enter_context(streamed([each], own))
         try:
             described = attributes.described(stream, scene, names, found)
+            sinks = foreseeing(run, folders, sinks)
             placed = placing.handed_on(described, made.trajectory, projection, sinks, selection)
         except CoverageError:
             if tally.packets:
@@ -132,6 +137,24 @@ def work(run: Run, folders: Folders) -> None:
             ) from None
     if WHOLE in folders:
         _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed, found)
+
+
+def foreseeing(run: Run, folders: Folders, sinks: list[placing.Sink]) -> list[placing.Sink]:
+    """The sinks; of a cloud.laz, what a report will show of it is read as soon as it is closed, beside the finishing of the others.
+
+    Not where the report shows the octree, or where photographs or uses come before it, which may change the cloud and need the memory.
+    """
+    survey = run.survey
+    asked = {each.name: each for each in chosen(survey.products)}
+    late = survey.images is not None or survey.uses
+    if REPORT not in asked or OCTREE in asked or CLOUD not in folders or late or not run.whole or cores() == 1:
+        return sinks
+    (options,) = asked[REPORT].options
+
+    def read() -> None:
+        run.foreseen = foreseen(folders[CLOUD] / CLOUD, options.points)
+
+    return [placing.Then(sinks[0], read), *sinks[1:]]
 
 
 def mount_errors(made: Estimate, survey: Survey) -> MountErrors:

@@ -101,7 +101,7 @@ def process(
         ledger = admitted(request, folder, force)
         was_empty = not ledger.entries
         try:
-            with Run(request, folder, progress) as run:
+            with Run(request, folder, progress, whole=until == ORDER[-1]) as run:
                 for step in steps()[: ORDER.index(until) + 1]:
                     _bring_up_to_date(step, run, ledger, force)
         except Exception as error:  # raised again: whatever went wrong, a folder that held nothing is left so

@@ -35,7 +35,10 @@ def work(run: Run, folders: Folders) -> None:
     quality = json.loads((run.folder / "quality.json").read_text(encoding="utf-8"))
     projection = projection_of(made.trajectory.frame, run.survey)
     digests = digests_of(run.folder)
-    context = Context(run.folder, run.folder, run.survey, made, projection, quality, digests, run.names)
+    context = Context(
+        run.folder, run.folder, run.survey, made, projection, quality, digests, run.names, foreseen=run.foreseen
+    )
+    run.foreseen = None
     beside(
         [
             functools.partial(draw, [each], replace(context, folder=folders[each.name]))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from flightlog.logfile import LogReader
 from flightlog.mount import Mount
@@ -21,6 +21,9 @@ from groundproc.steps.request import Request
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate, read_estimate
 
+if TYPE_CHECKING:
+    from groundproc.reporting.cloudpart import Foreseen
+
 
 class Run:
     """One run of some steps.
@@ -31,12 +34,21 @@ class Run:
     folder : Path
         Where the outputs of finished steps lie.
     progress : Progress
+    whole : bool
+        Whether all steps are brought up to date.
+
+    Attributes
+    ----------
+    foreseen : Foreseen or None
+        What the report will ask of the cloud, read by an earlier step.
     """
 
-    def __init__(self, request: Request, folder: Path, progress: Progress) -> None:
+    def __init__(self, request: Request, folder: Path, progress: Progress, whole: bool = False) -> None:
         self.request = request
         self.folder = folder
         self.progress = progress
+        self.whole = whole
+        self.foreseen: Foreseen | None = None
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:

@@ -1,14 +1,16 @@
 """Streams made ahead by a thread, and works done beside each other."""
 
 import functools
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from groundproc.machine import readahead, system
-from groundproc.machine.readahead import ahead, beside, both
+from groundproc.machine.readahead import ahead, beside, both, imported_meanwhile
 
 
 @pytest.fixture(autouse=True)
@@ -164,3 +166,18 @@ def test_an_interrupt_of_the_first_lets_one_work_end_and_begins_no_other() -> No
 
 def test_two_works_give_what_they_give() -> None:
     assert both(lambda: 1, lambda: "b") == (1, "b")
+
+
+def test_modules_are_imported_meanwhile_and_one_that_is_not_there_is_told_where_it_is_used(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "wanted_later.py").write_text("HERE = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    imported_meanwhile(["wanted_later", "nowhere_at_all"])
+    for thread in threading.enumerate():
+        if thread.name == "imports":
+            thread.join()
+    assert sys.modules.pop("wanted_later").HERE == 1
+    monkeypatch.setattr(readahead, "cores", lambda: 1)
+    imported_meanwhile(["wanted_later"])
+    assert "wanted_later" not in sys.modules

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from flightlog.errors import UsageError
 from groundproc.cli import main
 from groundproc.products import chosen
 from groundproc.products.product import Context, draw
-from groundproc.reporting import pdf
+from groundproc.reporting import cloudpart, pdf
 from groundproc.reporting.flightreport import Subject, compose
 from groundproc.steps.place import projection_of
 from groundproc.steps.process import remembered
@@ -117,8 +118,6 @@ def test_nothing_in_it_comes_from_elsewhere(page: Elements) -> None:
 
 
 def test_its_points_are_those_of_the_cloud(page: Elements, processed: Path) -> None:
-    import laspy
-
     scene = json.loads(page.held["scene"])
     raw = gzip.decompress(base64.b64decode(page.held["cloud-data"]))
     count, planes = np.frombuffer(raw, "<u4", 2).tolist()
@@ -136,6 +135,26 @@ def test_its_points_are_those_of_the_cloud(page: Elements, processed: Path) -> N
     )
     told, known = np.column_stack([steps, intensity.astype(int)]), np.column_stack([own, whole.intensity])
     np.testing.assert_array_equal(told[np.lexsort(told.T)], known[np.lexsort(known.T)])
+
+
+def test_points_read_before_are_taken_unless_the_cloud_is_another_by_then(processed: Path, tmp_path: Path) -> None:
+    staged = tmp_path / "staged.laz"
+    assert main(["export", str(processed / "cloud.copc.laz"), "-o", str(staged)]) == 0
+    before = cloudpart.foreseen(staged, 2000)
+    path = staged.rename(tmp_path / "cloud.laz")
+    assert cloudpart.read(tmp_path, 2000, before) is before.part
+    anew, fewer = cloudpart.read(tmp_path, 2000), cloudpart.read(tmp_path, 1000, before)
+    assert anew is not None
+    assert fewer is not None
+    np.testing.assert_array_equal(anew.points.xyz_m, before.part.points.xyz_m)
+    assert len(fewer.points) <= 1000
+    with laspy.open(path) as file:
+        las = file.read()
+    las.classification[:] = 2
+    las.write(path)
+    changed = cloudpart.read(tmp_path, 2000, before)
+    assert changed is not None
+    assert (changed.points.columns["classification"] == 2).all()
 
 
 def test_fewer_points_are_shown_where_the_file_would_be_too_large(processed: Path, tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from groundproc.cli import main
-from groundproc.steps import OF_IMAGES
+from groundproc.reporting import cloudpart
+from groundproc.steps import OF_IMAGES, place
 from groundproc.steps import ORDER as ALL
 from groundproc.steps.ledger import INSIDE
 from groundproc.steps.step import steps
@@ -103,6 +104,32 @@ def test_a_second_run_does_nothing_and_says_the_same(log: Path, out: Path, capsy
 def test_force_does_everything_and_gives_the_same_points(log: Path, out: Path, made: Path) -> None:
     assert process(log, out, "--force") == set(ORDER)
     assert (out / "cloud.laz").read_bytes() == (made / "cloud.laz").read_bytes()
+
+
+def test_what_the_report_shows_of_a_cloud_is_read_once_where_it_is_made_in_one_go(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads, read = list[str](), cloudpart._of
+
+    def counted(path: Path, most: int) -> cloudpart.CloudPart:
+        reads.append(path.parent.parent.name)
+        return read(path, most)
+
+    monkeypatch.setattr(cloudpart, "_of", counted)
+    monkeypatch.setattr(place, "cores", lambda: 2)
+    folder = tmp_path / "out"
+    words = ("process", str(log), "--method", "ins", "--products", "cloud.laz,report.html", "-o", str(folder))
+    assert main([*words, "--until", "place"]) in COMPLETE
+    assert reads == [], "nothing asks for it yet"
+    assert main(list(words)) in COMPLETE
+    assert reads == [tmp_path.name], "from the finished folder"
+    once = (folder / "report.html").read_text()
+    assert main([*words, "--force"]) in COMPLETE
+    assert len(reads) == 2
+    assert reads[1] != tmp_path.name, "from where it is made"
+    data = [re.findall(r'id="cloud-data">[^<]*', page) for page in (once, (folder / "report.html").read_text())]
+    assert data[0] == data[1]
+    assert data[0]
 
 
 @pytest.mark.parametrize(
