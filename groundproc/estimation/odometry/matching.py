@@ -68,11 +68,15 @@ class _Matches(NamedTuple):
         Distance from its plane.
     weight : ndarray, shape (n,)
         [1/m^2]
+    key, voxel : ndarray of int64, shape (n,)
+        Of the voxel that each lies in, and its row whatever it is, -1 where there is none.
     """
 
     row: Ints
     residual_m: Array
     weight: Array
+    key: Ints
+    voxel: Ints
 
 
 class _Clusters(NamedTuple):
@@ -150,6 +154,13 @@ def observable(information: Array, least: float) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def _no_matches(count: int) -> _Matches:
+    """Nothing is found yet: no voxel has the key -1."""
+    key, voxel = np.full(count, -1, np.int64), np.empty(count, np.int64)
+    return _Matches(np.empty(count, np.int64), np.empty(count), np.empty(count), key, voxel)
+
+
+@njit(cache=True, nogil=True)
 def _nothing() -> Normal:
     return Normal(np.zeros((6, 6)), np.zeros(6))
 
@@ -190,17 +201,20 @@ def _match(
     up, cone, total = ground
     body, counts = clusters
     per_m, (mat, position) = 1.0 / voxel_m, pose
-    row, residual, weight = found
+    row, residual, weight = found.row, found.residual_m, found.weight
     matched = 0
+    # voxels are looked up in a loop of their own, whose cache misses run side by side; from round to round few clusters change theirs
     for n in range(len(body)):
-        bx, by, bz = body[n, 0], body[n, 1], body[n, 2]
-        x = mat[0, 0] * bx + mat[0, 1] * by + mat[0, 2] * bz + position[0]
-        y = mat[1, 0] * bx + mat[1, 1] * by + mat[1, 2] * bz + position[1]
-        z = mat[2, 0] * bx + mat[2, 1] * by + mat[2, 2] * bz + position[2]
-        v = find(table, keys, voxel_key(x, y, z, per_m))
+        x, y, z = _at(mat, position, body, n)
+        key = voxel_key(x, y, z, per_m)
+        if key != found.key[n]:
+            found.key[n], found.voxel[n] = key, find(table, keys, key)
+    for n in range(len(body)):
+        v = found.voxel[n]
         row[n] = v
         if v < 0:
             continue
+        x, y, z = _at(mat, position, body, n)
         if voxels[v, SPREAD] > 0.0:
             matched += 1
             continue
@@ -226,6 +240,16 @@ def _match(
             for c in range(3):
                 total[c] += signed * voxels[v, NORMAL + c]
     return matched
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _at(mat: Array, position: Array, body: Array, n: int) -> Any:
+    """Where a pose places a cluster."""
+    bx, by, bz = body[n, 0], body[n, 1], body[n, 2]
+    x = mat[0, 0] * bx + mat[0, 1] * by + mat[0, 2] * bz + position[0]
+    y = mat[1, 0] * bx + mat[1, 1] * by + mat[1, 2] * bz + position[1]
+    z = mat[2, 0] * bx + mat[2, 1] * by + mat[2, 2] * bz + position[2]
+    return x, y, z
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -270,7 +294,7 @@ def _accumulate(
     """Normal equations of all matches, those on the ground by its mean normal and by their own apart; gives the sum of squares."""
     voxels, body, returns = planes.voxels, clusters.body_m, clusters.returns
     mat, position = pose
-    row, residual, weight = found
+    row, residual, weight = found.row, found.residual_m, found.weight
     j, off, axis, by, some = np.empty(6), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty(6)
     mean, unsure = _facing(planes, row, ground)
     squares = 0.0
@@ -425,7 +449,7 @@ def update(
     sums = Sums(_nothing(), _nothing(), _nothing(), _nothing())
     factor, inner = np.zeros((6, 6)), np.eye(6)
     clusters = _Clusters(body, counts)
-    found = _Matches(np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body)))
+    found = _no_matches(len(body))
     normals, up, axis, cone = ground.copy(), ground.copy(), ground.copy(), GROUND
     if not axis.any():
         axis[2], cone = 1.0, FIRST_GROUND

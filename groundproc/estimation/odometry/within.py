@@ -97,9 +97,11 @@ class Within:
         arrays, ground = planes
         up = ground / max(float(np.linalg.norm(ground)), 1e-12)
         found = np.zeros((NODES, 3))
+        voxel = np.empty(len(seen.world_m), np.int64)
+        _look_up(seen.world_m, arrays, voxel)
         for _ in range(ROUNDS):
             rows, pull = np.zeros_like(self._chain), np.zeros(3 * NODES)
-            _add(seen, place_m, arrays, up, found, (rows, pull))
+            _add((seen, voxel), place_m, arrays, up, found, (rows, pull))
             rows += self._chain
             rows[:3, :3] += self._information
             pull[:3] += self._information @ start
@@ -129,18 +131,26 @@ def _chain(density: float) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def _look_up(world: Array, planes: MapArrays, voxel: Ints) -> None:
+    """Row of the voxel that each cluster lies in, -1 where there is none."""
+    per_m = 1.0 / planes.voxel_m
+    for n in range(len(world)):
+        voxel[n] = find(planes.table, planes.keys, voxel_key(world[n, 0], world[n, 1], world[n, 2], per_m))
+
+
+@njit(cache=True, nogil=True)
 def _add(
-    seen: Seen, place_m: Array, planes: MapArrays, up: Array, turn: Array, system: tuple[Array, Array]
+    clusters: tuple[Seen, Ints], place_m: Array, planes: MapArrays, up: Array, turn: Array, system: tuple[Array, Array]
 ) -> None:  # fmt: skip
-    """Add what clusters say of the turns before and after them; `turn` as known so far, by which they lose weight."""
-    voxels, per_m = planes.voxels, 1.0 / planes.voxel_m
+    """Add what clusters say of the turns before and after them; `turn` as known so far, by which they lose weight; `voxel` of the map."""
+    (seen, voxel), voxels = clusters, planes.voxels
     arm, axis = np.empty(3), np.empty((3, 3))
     last = len(turn) - 1
     for n in range(len(seen.since_ns)):
-        x, y, z = seen.world_m[n, 0], seen.world_m[n, 1], seen.world_m[n, 2]
-        row = find(planes.table, planes.keys, voxel_key(x, y, z, per_m))
+        row = voxel[n]
         if row < 0:
             continue
+        x, y, z = seen.world_m[n, 0], seen.world_m[n, 1], seen.world_m[n, 2]
         v = voxels[row]
         if v[FLATNESS] < 0.0 and v[SPREAD] <= 0.0:
             continue
