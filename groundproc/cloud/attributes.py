@@ -1,8 +1,9 @@
 """What is said of each point beyond its place: the angles of its beam, how well it is known, what surface it lies on.
 
-Some of it follows from the point and its pose, some from what lies around it. For that the flight is gone through again, one stretch after
-the other: first all points of the stretch are gathered, for classes all beams are looked along, then each point is looked at again, in the
-same order. A stretch ends where memory does, so the cost is linear and the memory bounded.
+Some of this follows from the point and its pose, some from what lies around it. For the latter, the flight is
+processed again, one stretch after the other. First all points of the stretch are gathered; for classes, all beams are
+followed; then each point is processed again, in the same order. A stretch ends at a limit of memory, so the cost is
+linear and the memory bounded.
 """
 
 import itertools

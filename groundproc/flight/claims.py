@@ -1,8 +1,8 @@
-"""Absolute times held against each other: each is a claim, and some of the ways in which one is wrong can be recognised.
+"""Absolute times compared with each other: each is a claim, and some of the ways in which one is wrong can be recognised.
 
-A receiver with old firmware states dates that are whole eras of 1024 GPS weeks early. One that has not heard the leap seconds yet, or does
-not apply them, is whole seconds off. A recording computer without a clock begins in 1970. Device clocks are not claims: they tell how much
-time passed, and tie the claims to one instant.
+A receiver with old firmware states dates that are whole eras of 1024 GPS weeks early. One that has not heard of the
+leap seconds yet, or does not apply them, is whole seconds off. A recording computer without a clock begins in 1970.
+Device clocks are not claims: they say how much time passed, and tie the claims to one instant.
 """
 
 import itertools

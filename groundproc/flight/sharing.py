@@ -1,8 +1,8 @@
-"""Vehicles that share one MAVLink address, told apart by the numbers of their messages.
+"""Vehicles that share one MAVLink address, separated by the numbers of their messages.
 
-Two vehicles that nobody gave ids of their own are one sender by their address. But each counts its own messages, and its
-own time since boot: what one counter cannot explain and two can is of two senders. They are two vehicles where their
-clocks, attitudes or places contradict each other, and one that was heard by two links where they do not.
+Two vehicles that nobody gave ids of their own look like one sender by their address. But each counts its own messages,
+and its own time since boot. If one counter cannot explain a stream and two can, there are two senders. They are two
+vehicles if their clocks, attitudes or places contradict each other, and otherwise one that was heard over two links.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
-"""By how many seconds a camera's clock is off: that offset under which the trajectory's poses bring the rays of common points together.
+"""By how many seconds a camera's clock is off: the offset at which rays of common points fit the trajectory's poses best.
 
-The bundle adjustment finds tenths of a second. A clock that was set by hand is off by seconds, and images then begin tens of metres and
-several degrees wrong. Two rays of one point and the base between the two places lie in a plane, whatever the depth; by how much they do
-not, over all pairs, is least at the right offset: attitudes change from image to image, and strips of other headings move against each
-other.
+The bundle adjustment finds tenths of a second. A clock that was set by hand is off by seconds, and images then begin
+tens of metres and several degrees wrong. Two rays of one point and the base between the two camera positions lie in a
+plane, whatever the depth. The deviation from that, over all pairs, is least at the right offset, because attitudes
+change from image to image, and strips of other headings move against each other.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,14 @@
 """Is a boresight or a clock's shift real? Views that are held out must agree better with it than without.
 
-Every fifth station loses its image points. Its pose is then the trajectory's, with the mounting and the clock that the others found, and
-the points that the others placed are looked at from there. All groups are free to begin with, and the one that helps least is taken away
-until every one that is left helps: a boresight that is tried while a clock is still off by pixels makes nothing better.
+Every fifth station loses its image points. Its pose is then the trajectory's, with the mounting and the clock that the
+others found, and the points that the others placed are viewed from there. All groups of unknowns are free to begin
+with, and the one that helps least is removed until every one that is left helps: a boresight that is tried while a
+clock is still off by pixels improves nothing.
 
-What a view shows of its own strip alone moves with the strip: a clock that is off shows in the fewer points that strips of other
-headings share, and a median does not see them. So it is the RMS within a view that counts, of all but the worst, and the geometric mean
-of the views: one whose pose is bad anyway, as in a gap of GNSS, is so with and without, and drowns nothing.
+Points of a view's own strip move with the strip. A wrong clock shows only in the fewer points that strips of other
+headings share, and a median does not see them. So the measure of a view is the RMS of all but its worst points. Views
+are combined by the geometric mean: a view whose pose is bad anyway, as in a gap of GNSS, is bad with and without the
+change, and does not drown the others.
 """
 
 from collections.abc import Sequence

@@ -1,16 +1,18 @@
 """Image poses for the smoother: what the images know that the trajectory did not, so that nothing is counted twice.
 
-The adjustment of a block holds the trajectory's own poses. A pose handed back has the information gained, the inverse of its covariance
-after less that before, and stands where the two together give the adjusted pose. In directions in which images say nothing its variance is
-`MOST_SHARE` times that of the trajectory. That is what an engine takes that knows of each pose alone.
+The adjustment of a block holds the trajectory's own poses. A pose handed back has the information gained, the inverse
+of its covariance after the adjustment less that before, and is placed such that both together give the adjusted pose.
+In directions in which images say nothing, its variance is `MOST_SHARE` times that of the trajectory. This form is for
+engines that know each pose alone.
 
-The errors of adjusted poses hang together: a block is stiff to millimetres, and lies where all positions of a flight put it, to
-centimetres. Taken one by one as uncertain as they are, poses lose their shape; taken as certain as their shape is, they would pretend to
-know where they are. So the smoother gets the adjusted poses themselves, each with a small error of its own (`OWN_SHARE`), and what is left
-of its covariance as shared with its neighbours, which goes into what the smoother states and not into what it does. Given the poses at the
-images, what lies between them is told by inertial sensors alone, whatever the images saw: the mean of the whole trajectory is then that of
-trajectory and images together, and its covariance the sum of both parts. Where images say little of a pose its own error is large and the
-shared one nothing.
+The errors of adjusted poses are correlated: a block is stiff to millimetres, but lies where all positions of a flight
+put it, to centimetres. Taken one by one with their full uncertainty, poses lose their shape; taken as certain as their
+shape is, they would pretend to know where they are. So the smoother gets the adjusted poses themselves, each with a
+small error of its own (`OWN_SHARE`). The rest of its covariance is shared with its neighbours; it enters what the
+smoother states, but not its solution. Given the poses at the images, the path between them follows from inertial
+sensors alone, whatever the images saw. The mean of the whole trajectory is then that of trajectory and images
+together, and its covariance the sum of both parts. Where images say little about a pose, its own error is large and
+the shared one is zero.
 """
 
 from collections.abc import Sequence

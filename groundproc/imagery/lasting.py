@@ -1,9 +1,10 @@
 """Errors of a trajectory last: poses seconds apart are off alike, and a hundred of them say little more than one.
 
-How long is told by the block: held by its images and hardly by the trajectory, it is rigid, and the trajectory's departures from it follow
-each other where errors last. They are taken for a Markov process of first order, whose time constant and size are the likeliest ones with
-everything else, the poses, points, mounting and clocks, integrated out (restricted likelihood, Patterson & Thompson 1971): how well the
-images know the shape of the block is in it. Independent errors stay as they are.
+How long errors last is found from the block. Held by its images and hardly by the trajectory, it is rigid, and the
+trajectory's departures from it follow each other where errors last. They are modelled as a Markov process of first
+order. Its time constant and size are the likeliest ones with everything else (poses, points, mounting and clocks)
+integrated out (restricted likelihood, Patterson & Thompson 1971), which includes how well the images know the shape of
+the block. Independent errors stay as they are.
 """
 
 import itertools

@@ -1,9 +1,10 @@
-"""Reflectance by the lidar's own: bands of images put on the scale of what its echoes say of the same points (905 nm).
+"""Reflectance by the lidar's own: bands of images scaled to the reflectance of its echoes at the same points (905 nm).
 
-Near infrared is all but the lidar's wavelength: a line through what points reflect, over the light that images saw of them. Light has
-little noise and echoes have much, so echoes are averaged in classes of light. Other bands meet the lidar where the ground is grey: asphalt,
-concrete, gravel and white paint reflect some 0.95 of it in red, soil and leaves less, next to nothing more. So the highest ratio there is
-belongs to them, if the place has any.
+Near infrared is nearly the lidar's wavelength: a line is fitted through the reflectance of points, over the light that
+images saw of them. Light has little noise and echoes have much, so echoes are averaged in classes of light. Other
+bands meet the lidar where the ground is grey: asphalt, concrete, gravel and white paint reflect some 0.95 of it in
+red, soil and leaves less, and next to nothing more. So the highest ratio that occurs belongs to grey ground, if the
+place has any.
 """
 
 from collections.abc import Mapping

@@ -1,9 +1,9 @@
-"""Small steps ahead of a recording computer's clock, told from delays of a radio by what comes after them.
+"""Small forward steps of a recording computer's clock, told from delays of a radio by what comes after them.
 
-A radio may deliver messages 2 s late, so that a link alone cannot tell at the first late message whether the clock was
-set ahead by as much. What follows tells: a delay ends, or is uneven; after a step all messages are late by the same. So
-a link is looked at some seconds ahead. Larger steps and those back need no foresight, nor do recordings with a lidar,
-whose packets come in time.
+A radio may deliver messages 2 s late, so the first late message of a link cannot show whether the clock was set ahead
+by as much. What follows shows it: a delay ends, or is uneven; after a step all messages are late by the same amount.
+So a link is examined some seconds ahead. Larger steps, and steps back, need no foresight, nor do recordings with a
+lidar, whose packets come in time.
 """
 
 from collections import deque

@@ -1,9 +1,9 @@
-"""Receive times of a recording, made right by the clocks of the devices in it.
+"""Receive times of a recording, corrected by the clocks of the devices in it.
 
-The clock of a recording computer may be set while it records, by an hour or by 56 years, and single stamps may be wild. The devices' own
-clocks go on all the while. So it is found out message by message what stepped. Where a device's clock went on as it does from one message
-to the next and the stamp did not, the stamp is wrong. Where the device's clock jumped and the stamp went on, it was the device. Where both
-went on by as much, there was silence.
+The clock of a recording computer may be set while it records, by an hour or by 56 years, and single stamps may be
+wild. The devices' own clocks run on all the while. So it is decided message by message what stepped. If a device's
+clock went on normally from one message to the next and the stamp did not, the stamp is wrong. If the device's clock
+jumped and the stamp went on, it was the device. If both went on by as much, there was silence.
 """
 
 from collections.abc import Iterable, Iterator
