@@ -100,7 +100,7 @@ def shots(
     lasers : LaserTable, optional
         Default: the manual's.
     tally : Tally, optional
-        Is added to.
+        Is added to; without one nobody counts, and packets are not looked through for what is missing.
     progress : callable, optional
         Called with the number of file bytes done since the last call.
     """
@@ -111,9 +111,7 @@ def shots(
         read += done
 
     told = 0
-    with contextlib.closing(
-        ahead(_decoded(readers, timeline, gate, lasers, tally or Tally(), count), _READING)
-    ) as pieces:
+    with contextlib.closing(ahead(_decoded(readers, timeline, gate, lasers, tally, count), _READING)) as pieces:
         for piece in pieces:
             yield piece
             del piece  # before the next one is waited for
@@ -129,28 +127,31 @@ def _decoded(
     timeline: Sequence[LidarClock],
     gate: Gate,
     lasers: LaserTable | None,
-    tally: Tally,
+    tally: Tally | None,
     progress: Progress,
 ) -> Iterator[Shots]:
     """The shots, piece by piece."""
     lidar = lidar_of(readers)
-    tally.summary = tally.summary or LidarSummary(lidar)
+    if tally is not None:
+        tally.summary = tally.summary or LidarSummary(lidar)
     for batches in _pieces(load.lidar_batches(readers, progress, lidar), lidar, tally):
         packets = load.joined([batch.packets for batch in batches])
         leg = _leg_of(int(batches[0].receive_time_ns[0]), timeline)
         if leg is None:
-            tally.packets_without_leg += len(packets)
+            if tally is not None:
+                tally.packets_without_leg += len(packets)
             continue
         device_ns = np.concatenate([batch.device_time_ns for batch in batches])
         yield from lidar.decode(packets, leg.utc_from_lidar(device_ns), gate, lasers)
 
 
-def _pieces(batches: Iterator[LidarBatch], lidar: Lidar, tally: Tally) -> Iterator[list[LidarBatch]]:
+def _pieces(batches: Iterator[LidarBatch], lidar: Lidar, tally: Tally | None) -> Iterator[list[LidarBatch]]:
     """Batches that may be decoded as one, about half a second together: that bounds the memory."""
     waiting: list[LidarBatch] = []
     size = 0
     for batch in batches:
-        tally.add(batch)
+        if tally is not None:
+            tally.add(batch)
         if not len(batch.packets):
             continue
         new = bool(waiting) and (batch.jumped or not lidar.same_kind(waiting[-1].packets, batch.packets))

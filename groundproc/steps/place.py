@@ -110,7 +110,7 @@ def work(run: Run, folders: Folders) -> None:
     gate = Gate(*survey.fov_deg, survey.min_range_m, survey.max_range_m)
     lasers, names = made.corrections.table(lidar.lasers), attributes.wanted(survey.attributes)
     told = shared(functools.partial(run.progress, "place"), attributes.passes(names))
-    tallies = itertools.chain([tally], iter(Tally, None))  # the packets of a second pass are the same ones
+    tallies = itertools.chain([tally], itertools.repeat(None))  # the packets of a second pass are the same ones
 
     def stream() -> Iterator[Points]:
         seen = shots(run.readers, timeline, gate, lasers, next(tallies), told)

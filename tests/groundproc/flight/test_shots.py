@@ -16,6 +16,7 @@ from groundproc.flight.flight import read_flight
 from groundproc.flight.mounting import find_mount
 from groundproc.flight.pairing import legs
 from groundproc.flight.shots import Tally, shots
+from groundproc.flight.summary.lidar import LidarSummary
 from groundproc.flight.timeline import Leg
 from groundproc.sensors.shots import Gate
 
@@ -47,6 +48,18 @@ def test_a_piece_is_half_a_second_and_no_shot_is_lost_between_two(reader: LogRea
     assert sum(map(len, pieces)) + sum(gated) == tally.packets * hdl32e.BLOCKS * hdl32e.LASERS
     times = np.concatenate([piece.time_ns for piece in pieces])
     assert (np.diff(times) > 0).all()
+
+
+def test_shots_are_the_same_where_nobody_counts_and_packets_are_not_looked_through(
+    reader: LogReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timeline, counted = timeline_of(reader), Tally()
+    pieces = list(shots([reader], timeline, Gate(), tally=counted))
+    assert counted.packets
+    monkeypatch.setattr(LidarSummary, "add", None)
+    for piece, same in zip(pieces, shots([reader], timeline, Gate()), strict=True):
+        np.testing.assert_array_equal(piece.xyz_m, same.xyz_m)
+        np.testing.assert_array_equal(piece.time_ns, same.time_ns)
 
 
 def test_packets_that_a_capture_lacks_are_counted_though_no_recorder_says_so(recordings: Path, tmp_path: Path) -> None:
