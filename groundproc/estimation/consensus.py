@@ -27,7 +27,7 @@ a tenth of a metre is new each second."""
 GATE_SIGMAS: Final = 5.0
 """A step may be off by so many of its sigmas."""
 EASY: Final = 0.36
-"""A step whose square is less of the gate's, three of five sigmas, is none that leads away."""
+"""A step whose square is below this share of the gate's (three of five sigmas) does not count as leading away."""
 LOOKED_BACK_S: Final = (4.0, 16.0)
 """From so long ago a step is looked at too."""
 LONGEST_S: Final = 600.0

@@ -37,7 +37,7 @@ SPEED_S: Final = 1.5
 BENDING_M_S2: Final = 3.0
 """What a vehicle's acceleration changes by between two fixes (1 sigma): a way from two velocities does not know it."""
 AGE_S: Final = 0.2
-"""Positions are as much older than the velocity beside them (1 sigma)."""
+"""By how much positions are older than the velocity beside them (1 sigma)."""
 HEADING: Final = 0.15
 """How far an autopilot's heading is off [rad]: forces are turned by it (1 sigma)."""
 _WINDOW: Final = 9

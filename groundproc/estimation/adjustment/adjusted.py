@@ -57,7 +57,7 @@ REFINING: Final = 0.2
 FIRM: Final = 1.5
 """Times the usual sigma of its places up to which a smoother's trajectory guides the odometry."""
 LEAST_LASERS: Final = 8
-"""Of a lidar whose motion the adjustment can tell from its returns."""
+"""Fewest lasers of a lidar whose motion the adjustment can find from its returns."""
 
 
 def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observation] = ()) -> Estimate:

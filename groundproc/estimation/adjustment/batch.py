@@ -23,12 +23,13 @@ Array = npt.NDArray[np.float64]
 ROUNDS: Final = ((1.0, False), (0.5, False), (0.5, True), (0.5, True))
 """Edge of the voxels [m], and whether outliers are cut, of each Gauss-Newton step."""
 ROUGH: Final = 1e-3
-"""Of a step that comes before outliers are cut, this share of what it gains may be missing."""
+"""Before outliers are cut, a step may leave this share of its gain."""
 MORE_ROUNDS: Final = 5
 SETTLED_M: Final = 0.003
-"""The last step is taken again, so often at most, until the path's shape moves less than this, RMS."""
+"""The last step is repeated, at most so many times, until the path's shape moves by less than this, RMS."""
 DRAWS: Final = 12
-"""Draws of the path's error: its variance in itself is right to two fifths, and to less as a mean over a second."""
+"""Draws of the path's error. The variance of the path in itself is right to two fifths, and better as a mean over a
+second."""
 WORLD_TURN_RAD: Final = np.deg2rad([5.0, 5.0, 20.0])
 WORLD_SHIFT_M: Final = np.full(3, 100.0)
 """What the path as a whole may be turned and shifted by."""

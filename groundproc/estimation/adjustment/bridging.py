@@ -23,13 +23,13 @@ FEWEST_MATCHED: Final = 50
 START: Final = 10
 """First slices that are not counted: there is no map yet."""
 KEPT: Final = 30
-"""Slices on end that hold and are worth keeping: three seconds."""
+"""Consecutive slices that hold the path and are worth keeping: three seconds."""
 SHORTEST: Final = 100
 """Slices of a stretch that is bridged: over less than 10 s inertial data between two good ends are better than any GNSS."""
 TAIL_NS: Final = 500_000_000
 """So much at the end of a flight may lie beyond what the smoother covers."""
 CLOSED: Final = 5
-"""Slices that seem to hold between two stretches and are fewer belong to them."""
+"""Fewer slices than this that seem to hold the path between two loose stretches belong to these."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,10 +31,10 @@ from groundproc.trajectory.trajectory import Trajectory
 Array = npt.NDArray[np.float64]
 
 SETTLING: Final = (60, 150)
-"""Slices after which there is a map that the first half of them, flown when there was none yet, is run again against, and so stated late:
-six seconds where the lidar holds the path well, and up to fifteen where it does not."""
+"""Slices after which their first half, flown when there was no map, is run again against the map that there is now,
+and so stated late: six seconds where the lidar holds the path well, and up to fifteen where it does not."""
 HELD_M: Final = 0.05
-"""Sigma of the direction that a slice tells least of, in the last second, from which on it holds the path well."""
+"""Sigma of the least observed direction of a slice, in the last second, from which on it holds the path well."""
 
 
 @dataclass(slots=True)

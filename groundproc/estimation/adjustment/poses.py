@@ -14,7 +14,7 @@ from groundproc.trajectory.covariance import SIZE
 Array = npt.NDArray[np.float64]
 
 LEAST_SIGMA: Final = 1e-12
-"""Below it an error is none, and goes with no other [m, rad]."""
+"""A smaller error counts as none, and is correlated with no other [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True)

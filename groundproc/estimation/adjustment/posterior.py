@@ -23,7 +23,8 @@ EXACT: Final = 1e-8
 """Of a covariance by weights no more than this share of the prior's variance is missing."""
 ENOUGH_OF_DRAWS: Final = 1e-3
 ENOUGH_OF_COLUMNS: Final = 3e-3
-"""What may be missing of a draw, as a share of all that it moves, and of a column of the inverse: of the variance that it stands for."""
+"""Share that may be missing: of a draw, as a share of all that it moves; of a column of the inverse, of the variance
+that it stands for."""
 LEVER_M: Final = 10.0
 """How a turn counts against a shift where a path's own rigid part is told from it."""
 

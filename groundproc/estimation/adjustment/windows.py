@@ -42,13 +42,13 @@ through the gyro, and no flight tells the two apart."""
 LEVER_FLOOR_M: Final = 0.003
 """The same for the lever arm, which is found through accelerometers whose axes are no better."""
 UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
-"""What the residuals do not show, by the global that it is in."""
+"""Uncertainty that the residuals do not show, by the global that contains it."""
 SMOOTH: Final = 11
 SMOOTH_DRAWS: Final = 101
 """Slices over which variances of poses are averaged, and correlations of what is drawn: ten seconds hold several times the errors that
 one knot has, and a leg of the flight is longer."""
 CALIBRATION: Final = ("ins.turn", "ins.lever", "ins.scale", "ins.delay", "ins.drift", "lidar.delay")
-"""What other flights go by: their covariance is not drawn, but solved for column by column."""
+"""Globals that other flights use: their covariance is not drawn, but solved for column by column."""
 
 
 @dataclass(slots=True)

@@ -36,7 +36,8 @@ FEWEST: Final = 10
 KNOWN: Final = 0.5
 """A parameter counts as found where its sigma is below this share of what was known before."""
 SIGNIFICANT: Final = 3.0
-"""A parameter within so many sigmas, those of the axes included, of what it was is not said to have changed."""
+"""A parameter that differs from its old value by less than so many sigmas, those of the axes included, is not reported
+as changed."""
 DOUBTFUL: Final = 0.001
 """Flights that differ so much that chance makes it rarer than this do not agree."""
 

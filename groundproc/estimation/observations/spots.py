@@ -18,7 +18,7 @@ WIDEST_M: Final = 12.0
 SOUGHT_M: Final = 0.5
 """A map that cannot be farther off than this is not searched for."""
 FORETOLD_M: Final = 1.0
-"""So well, three sigma, others have to tell where the surface of a spot is."""
+"""How well, three sigma, the other spots have to predict the surface of a spot."""
 
 
 @dataclass(slots=True)

@@ -19,8 +19,9 @@ Array = npt.NDArray[np.float64]
 LEAST_TURN: Final = 0.4
 """Of what a gyro's samples scatter: its noise is not taken to be below that. Most of the scatter is vibration, which it follows."""
 LEAST_FORCE: Final = 1.0
-"""The same of an accelerometer: what shakes it is over between two samples, and as bad as noise. Residuals do not tell: the lidar knows a
-slice's place to a centimetre, which over a tenth of a second is some m/s^2, so the path follows the accelerometer and not the lidar."""
+"""The same of an accelerometer. What shakes it is over between two samples, and as bad as noise. Residuals do not
+reveal it: the lidar knows a slice's place to a centimetre, which over a tenth of a second is some m/s^2, so the path
+follows the accelerometer and not the lidar."""
 FEWEST_HELD: Final = 30
 """Slices that the lidar has to hold for residuals to tell a unit's noise: three seconds."""
 

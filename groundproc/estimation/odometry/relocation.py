@@ -34,12 +34,13 @@ APART_M: Final = 1.0
 """Places so far apart are two."""
 FEWEST_ON: Final = 60
 LEAST_SHARE: Final = 0.6
-"""Of what could be shown, so much has to be there."""
+"""Of the points that could be shown, this share has to be there."""
 SURER: Final = 2.5
-"""Points that lie on surfaces at one of two places only have to be of the better one by so many sigmas of chance (McNemar 1947)."""
+"""Of the points that lie on surfaces at only one of two places, those of the better place have to prevail by so many
+sigmas of chance (McNemar 1947)."""
 HELD_M: Final = 0.1
 HELD_RAD: Final = np.deg2rad(0.5)
-"""How well the worst direction has to be told."""
+"""How well the least observed direction has to be known."""
 FLOOR: Final = np.repeat([np.deg2rad(0.05), 0.02], 3)
 """What is claimed of turn [rad] and shift [m] at best."""
 

@@ -31,17 +31,18 @@ WIDE_AT_M: Final = (28.0, 60.0)
 LOST_M: Final = 15.0
 LOST_SIGMAS: Final = 6.0
 LOST_FIXES: Final = 8
-"""So many fixes on end that lie farther off than both: the odometry has lost its way, and begins anew, unless the lidar holds it."""
+"""So many consecutive fixes farther off than both limits mean that the odometry has lost the path: it begins anew,
+unless the lidar holds it."""
 CHECKED: Final = 10
-"""Slices over which the way is compared with a guide's: a second."""
+"""Slices over which the path is compared with a guide's: a second."""
 ASTRAY_M: Final = 1.5
 """What it may differ by; a smoother's velocity is right to 0.1 to 0.3 m/s."""
 GUIDED_M_S: Final = 1.0
 """Sigma of a guide's velocity as it is taken slice by slice: right to 0.3 m/s, and its error lasts for a second at least."""
 SURE_HELD_M: Final = 0.03
-"""A way that slices tell better than this is the lidar's to tell."""
+"""A path that slices observe better than this is left to the lidar."""
 HELD_SHARE: Final = 0.98
-"""Of the slices that have to tell so much, for a path to be held."""
+"""Share of the slices that have to observe the path that well, for it to be held."""
 FIX_TAU_S: Final = 1.0
 """The filter takes positions as if their errors lasted so long: light beside the lidar, and firm enough to hold it where there is none."""
 RECENT_S: Final = 0.5
