@@ -60,7 +60,15 @@ def _allow(points: int) -> None:
 
     used = resource.getrusage(resource.RUSAGE_SELF)
     end = int(used.ru_utime + used.ru_stime) + _PATIENCE_CPU_S + points // _POINTS_PER_CPU_S
-    resource.setrlimit(resource.RLIMIT_CPU, (end, resource.RLIM_INFINITY))
+    _limit(resource.RLIMIT_CPU, end)
+
+
+def _limit(kind: int, value: int) -> None:
+    """Set a limit, no higher than what this process may have at all, such as under `ulimit` or a batch system."""
+    import resource
+
+    most = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (value if most == resource.RLIM_INFINITY else min(value, most), most))
 
 
 def _unpack(task: Task) -> None:
@@ -95,7 +103,7 @@ def main() -> None:
     import resource
 
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (task.memory_bytes, task.memory_bytes))
+    _limit(resource.RLIMIT_AS, task.memory_bytes)
     try:
         _unpack(task)
     except BaseException as error:

@@ -1,6 +1,6 @@
 """The floor of a cloud: the ground by its lowest points, over which heights of all its points are told.
 
-One reading of the cloud, of a sparse one two; rasters lie in temporary files without a name.
+One reading of the cloud, of a sparse one two, of a very sparse one three; rasters lie in temporary files without a name.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,7 +14,8 @@ from flightlog.errors import CoverageError
 from groundproc.analysis.terrain.filter import bare_ground, smoothed
 from groundproc.analysis.terrain.halls import HALO_M
 from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
-from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, settings_for
+from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, PRESETS, settings_for
+from groundproc.analysis.terrain.sparse import SPARSE_M2, bounds_m2, cell_for, density_of
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.cloud import reader
 from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, NO_SURFACE, PANE, UNCLASSIFIED
@@ -67,6 +68,9 @@ class Floor:
         window_m: float | None = None,
     ) -> None:
         self.cloud, self.metres, self.progress, self._folder = cloud, metres_of(cloud), progress, folder
+        thin_m2 = self._thin_m2()
+        if thin_m2 is not None and cell_m is None:
+            cell_m = cell_for(thin_m2, PRESETS["auto"].window_m if window_m is None else window_m)
         lowest = Cells(FINE_M if cell_m is None else cell_m, {"min", "count"})
         self._lonely = Lonely()
         for _, xyz, noise in self.pieces():
@@ -75,7 +79,7 @@ class Floor:
         fine = lowest.grid()
         if fine is None:
             raise CoverageError(f"{cloud.path}: all its points are classed as noise or as what moves")
-        self.density_m2 = _density(lowest, fine)
+        self.density_m2 = _density(lowest, fine) if thin_m2 is None else thin_m2
         self.settings = settings_for(terrain, self.density_m2, cell_m, window_m)
         side_m = 4.0 / np.sqrt(self.density_m2)
         if side_m > LEAST_SIDE_M:  # of a sparse cloud most points are further than that from each other
@@ -83,6 +87,13 @@ class Floor:
             for _, xyz, _ in self.pieces():
                 self._lonely.add(xyz)
         self._find(lowest, fine)
+
+    def _thin_m2(self) -> float | None:
+        """Points in a square metre of a cloud that was thinned so far that cells have to go by it; None for all others."""
+        if self.cloud.points >= SPARSE_M2 * bounds_m2(self.cloud.path, self.metres.across):
+            return None
+        found = density_of(xyz for _, xyz, _ in self.pieces())
+        return found if found < SPARSE_M2 else None
 
     def pieces(self) -> Iterator[tuple[Any, Array, npt.NDArray[np.bool_]]]:
         """Records, their places in metres, and which belong to no surface outdoors: by their class noise, what moved, or behind panes."""

@@ -11,6 +11,7 @@ import pytest
 import rasterio
 import shapely
 
+from groundproc.analysis.terrain.sparse import SPARSE_M2, cell_for, density_of
 from groundproc.cli import main
 from groundproc.cloud.classes import OF_USES
 from simulator import outdoors
@@ -215,3 +216,24 @@ def test_what_other_uses_classed_survives(tmp_path: Path) -> None:
     assert np.isin(after[~ours], (2, 3, 4, 5, 6, 7, 9, 18)).all()
     figures = json.loads((tmp_path / "f.json").read_text())
     assert sum(figures["classes"].values()) == figures["points"] == len(after)
+
+
+def test_a_cloud_of_a_point_in_hundreds_of_square_metres_has_cells_to_match(tmp_path: Path) -> None:
+    """Else the raster is of its bounds, whatever lies in it: this took minutes."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 1500.0, (6280, 2))
+    cloud = write_cloud(tmp_path / "c.laz", np.column_stack([xy, 20.0 * np.sin(xy[:, 0] / 200.0)]))
+    words = ["ground", str(cloud), "-o", str(tmp_path / "o.laz"), "--json", str(tmp_path / "f.json")]
+    assert main(words) == 0
+    assert json.loads((tmp_path / "f.json").read_text())["cell_m"] == 4.0
+    assert np.mean(np.asarray(laspy.read(tmp_path / "o.laz").classification) == 2) > 0.95
+
+
+def test_cells_go_by_the_squares_that_have_points() -> None:
+    along = np.linspace(0.0, 40_000.0, 50_000)
+    corridor = np.column_stack([along, 0.6 * along, np.zeros_like(along)])
+    assert len(along) / np.ptp(corridor[:, 0]) / np.ptp(corridor[:, 1]) < 1e-4
+    assert density_of([corridor[:30_000], corridor[30_000:]]) == pytest.approx(50_000 / 498 / 128**2, rel=0.1)
+    assert cell_for(SPARSE_M2, 20.0) == 2.0
+    assert [cell_for(each, 20.0) for each in (10.0, 0.013, 0.003, 1e-9)] == [1.0, 1.0, 4.0, 16.0]
+    assert cell_for(1e-9, 5.0) == 4.0

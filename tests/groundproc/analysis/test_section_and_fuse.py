@@ -9,6 +9,7 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
+from groundproc.analysis.registration import register
 from groundproc.cli import main
 
 ORIGIN = np.array([533_000.0, 6_472_000.0, 100.0])
@@ -92,6 +93,19 @@ def test_clouds_of_other_kinds_are_laid_on_the_first(tmp_path: Path, capsys: pyt
     told = capsys.readouterr().err
     assert "of one place" in told or "on surfaces found" in told
     assert not (tmp_path / "g.laz").exists()
+
+
+def test_a_block_of_a_third_that_moved_as_one_does_not_pull() -> None:
+    rng = np.random.default_rng(5)
+    a, b = yard(rng, 40_000), yard(rng, 40_000)
+    block = (b[:, :2] < 2.0).all(axis=1)
+    assert 0.25 < block.mean() < 0.35
+    b[block] += (0.1, 0.0, -0.15)
+    turn, shift = Rotation.from_rotvec(np.radians([0.1, -0.05, 0.28])), np.array([0.2, -0.18, 0.12])
+    found = register(a, turn.inv().apply(b - shift))
+    off = Rotation.from_matrix(found.matrix[:3, :3]) * turn.inv()
+    assert np.rad2deg(off.magnitude()) < 0.01
+    assert np.abs(found.move(turn.inv().apply(-shift)[None])).max() < 0.002
 
 
 def test_what_fits_moved_along_itself_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
