@@ -39,7 +39,7 @@ from groundproc.estimation.observations.attitudes import attitude_track
 from groundproc.estimation.observations.fixes import SLID_SIGMAS, position_track
 from groundproc.estimation.observations.observation import Flown, Observation
 from groundproc.estimation.observations.rows import turned
-from groundproc.estimation.odometry.beginning import BEGINNING, redo_beginning
+from groundproc.estimation.odometry.beginning import AFTER, BEGINNING, redo_beginning
 from groundproc.estimation.odometry.motion import Motion, base_motion, gyro_offset
 from groundproc.estimation.odometry.slices import Slice, slices
 from groundproc.estimation.odometry.stated import Recorded
@@ -216,6 +216,8 @@ def adjust_run(
             continue
         if len(tracker.track) <= BEGINNING:
             early.append(piece)
+        if len(tracker.track) >= BEGINNING + AFTER and tracker.odometry is not None:
+            tracker.odometry.turns = False  # only the map that the beginning is run again on goes by them
         if len(tracker.track) - begin >= WINDOW:
             _redo(tracker, motion, early)
             last = len(tracker.track)
@@ -252,7 +254,7 @@ def firm(guide: Trajectory) -> Trajectory:
 def _redo(tracker: Tracker, motion: Motion, early: list[Slice]) -> None:
     """The beginning again, before the first window; its slices are not kept after that."""
     if early and tracker.track is not None and tracker.odometry is not None:
-        redo_beginning(tracker.track, motion, early, tracker.odometry)
+        redo_beginning(tracker.track, motion, early, tracker.odometry, turns=False)
     early.clear()
 
 

@@ -31,8 +31,8 @@ SURE_M: Final = 0.15
 
 
 def redo_beginning(
-    track: Track, motion: Motion, early: Sequence[Slice], before: Odometry, count: int | None = None
-) -> None:
+    track: Track, motion: Motion, early: Sequence[Slice], before: Odometry, count: int | None = None, turns: bool = True
+) -> None:  # fmt: skip
     """Run the first slices again and put the result into the track.
 
     Parameters
@@ -45,6 +45,8 @@ def redo_beginning(
         As it is at the end of the track: biases, gravity and the line of the spin are known by then.
     count : int, optional
         Slices that are run again; where left out `BEGINNING`, and no more than a third of a track that is short.
+    turns : bool
+        Whether the turns within these slices are found: a batch does not use them.
     """
     count = min(BEGINNING, len(track) // 3) if count is None else count
     if count < 20:
@@ -63,7 +65,7 @@ def redo_beginning(
         -track.gyro_bias[count - 1], state.accel_bias_m_s2.copy(), state.gravity_m_s2.copy(), np.diag(SIGMA**2),
     )  # fmt: skip
     line = None if before.line is None else before.line.reversed()
-    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line)
+    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line, turns)
     odometry.map = _map_of(track, motion, count, min(count + AFTER, len(track)))
     found: dict[int, tuple[State, Step | None]] = {}
     for piece in reversed(early):

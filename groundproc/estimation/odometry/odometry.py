@@ -53,7 +53,7 @@ class Step:
     unheld_m, next_unheld_m : float
         Sigmas of the two directions that they observe least; infinite before there is a map.
     quats : ndarray, shape (STEPS + 1, 4)
-        Attitudes on the grid over the slice, corrected, as they are stated.
+        Attitudes on the grid over the slice, corrected, as they are stated: with the turns within it where these are found.
     """
 
     number: int
@@ -85,6 +85,15 @@ class Odometry:
         Edge of the map's voxels.
     line : Line, optional
         The line of the spin, where it is to be found in time and taken off the lidar's own gyro.
+    turns : bool
+        Whether the turns within slices are found (`within`). They are for who uses the attitudes of a step: neither the filter nor its
+        map goes by them.
+
+    Attributes
+    ----------
+    state, number, voxel_m, line, turns
+        As they are by now.
+    map : PlaneMap
     """
 
     MOST: Final = 4000.0
@@ -92,8 +101,10 @@ class Odometry:
     REACH_M: Final = 250.0
     """The map forgets what lies farther away than this."""
 
-    def __init__(self, state: State, motion: MotionGrid, number: int, voxel_m: float, line: Line | None = None) -> None:
-        self.state, self.number, self.voxel_m = state, number, voxel_m
+    def __init__(
+        self, state: State, motion: MotionGrid, number: int, voxel_m: float, line: Line | None = None, turns: bool = True
+    ) -> None:  # fmt: skip
+        self.state, self.number, self.voxel_m, self.turns = state, number, voxel_m, turns
         self._motion = motion
         self.map = PlaneMap(voxel_m)
         self._cluster = Clusterer(voxel_m)
@@ -166,9 +177,10 @@ class Odometry:
             turn = _mat(s.quat) @ before.T
             positions, world = (s.position_m + (each - end_m) @ turn.T for each in (positions, world))
             quats = frames.quat_multiply(frames.quat_from_mat(turn[None]), quats)
-            seen = Seen(clusters["time_ns"] - start_ns, world, returns)
-            within = self._within(seen, positions, turn, (self.map.arrays, self._ground))
-            quats = frames.quat_multiply(frames.quat_exp(within), quats)
+            if self.turns or piece.laser is not None:
+                seen = Seen(clusters["time_ns"] - start_ns, world, returns)
+                within = self._within(seen, positions, turn, (self.map.arrays, self._ground))
+                quats = frames.quat_multiply(frames.quat_exp(within), quats)
         self.map.insert(world, clusters, self.MOST)
         count = len(clusters)
         if piece.laser is not None:

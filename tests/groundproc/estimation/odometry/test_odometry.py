@@ -131,6 +131,20 @@ def test_in_a_room_the_true_motion_is_found(noise_m: float, place_m: float, turn
     assert sigma[GYRO].max() < np.deg2rad(0.1)
 
 
+def test_without_the_turns_within_slices_all_but_the_attitudes_stated_of_a_step_is_the_same() -> None:
+    both = [Odometry(start(), motion(), 0, 0.5, turns=turns) for turns in (True, False)]
+    stated = []
+    for number in range(6):
+        seen, bare = (each.step(piece(number, room, 0.02)) for each in both)
+        for name in ("quat", "position_m", "velocity_m_s", "gyro_bias_rad_s", "sigma", "clusters", "world_m"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(bare, name))
+        stated.append(np.abs(seen.quats - bare.quats).max())
+    first, second = (each.map.voxels[: each.map.count] for each in both)
+    np.testing.assert_array_equal(first, second)
+    assert stated[0] == 0.0, "there is no map yet"
+    assert min(stated[1:]) > 0.0
+
+
 def test_over_an_infinite_plane_nothing_is_learnt_of_place_and_heading() -> None:
     """East, north and heading stay as uncertain as at the start, or more; height and tilt are held.
 
