@@ -13,7 +13,7 @@ Positions are not changed.
 """
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -29,6 +29,7 @@ from groundproc.estimation.odometry.slices import Clusterer, Slice
 from groundproc.estimation.odometry.spline import Path, PathArrays
 from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, TILT, MapArrays, PlaneMap, find
 from groundproc.machine.readahead import ahead
+from groundproc.numerics.parts import at_once
 from groundproc.numerics.rotations import mat_of_quat
 from groundproc.numerics.voxelhash import voxel_key
 
@@ -115,9 +116,36 @@ def _turn(
     if turns[here.start].any():
         diagonal[0] += np.eye(3) / SURE_RAD**2
         pull[0] -= turns[here.start] / SURE_RAD**2
-    for some in clusters:
-        _add(some["time_ns"], some["xyz"], some["count"], part.arrays, planes.arrays, (diagonal, beside, pull))
+
+    def add(some: Sequence[npt.NDArray[np.void]]) -> None:
+        for each in some:
+            _add(each["time_ns"], each["xyz"], each["count"], part.arrays, planes.arrays, (diagonal, beside, pull))
+
+    parts = apart(clusters)
+    at_once(lambda number: add(parts[number]), 2)
+    add(parts[2])
     turns[here] = solved(diagonal, beside, -pull)
+
+
+def apart(clusters: Sequence[npt.NDArray[np.void]]) -> list[Sequence[npt.NDArray[np.void]]]:
+    """Slices in three: two parts that share no pose of the grid and may be added at once, and what lies between them.
+
+    Where slices are not in the order of time, all lie between.
+    """
+    middle = len(clusters) // 2
+    parts: list[Sequence[npt.NDArray[np.void]]] = [
+        clusters[:middle],
+        clusters[middle + 1 :],
+        clusters[middle : middle + 1],
+    ]
+    times = [np.concatenate([each["time_ns"] for each in some]) if some else np.empty(0, np.int64) for some in parts]
+    first, last, between = times
+    if not (len(first) and len(last) and len(between)):
+        return [[], [], clusters]
+    # a cluster touches the poses before and after it; a slice lies between the parts, and is more than two steps of the grid
+    if last.min() - first.max() < 3 * STEP_NS:
+        return [[], [], clusters]
+    return parts
 
 
 def gyro_information(quat: Array, density: float) -> tuple[Array, Array]:

@@ -8,9 +8,9 @@ import pytest
 
 from flightlog import frames
 from groundproc.estimation.adjustment import fine
-from groundproc.estimation.adjustment.fine import BACK_S, gyro_information, refined, solved
+from groundproc.estimation.adjustment.fine import BACK_S, apart, gyro_information, refined, solved
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
-from groundproc.estimation.odometry.slices import Slice
+from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Slice
 from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
@@ -104,6 +104,33 @@ def test_parts_of_a_flight_go_on_where_the_one_before_ended(
     assert np.linalg.norm(steps[borders - 1], axis=1).max() < 4.0 * DENSITY * np.sqrt(STEP_NS * 1e-9)
     before, after = (np.square(off_rad(each, true)).mean() for each in (path, made))
     assert after < 0.7 * before  # a second's map is not as good as that of two and a half
+
+
+def test_two_parts_at_once_give_what_one_after_the_other_does(
+    true: Path, pieces: list[Slice], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But for the order of a few sums, at the poses beside the slice between them."""
+    path = noisy(true)
+    parted = at(path, pieces)
+    monkeypatch.setattr(fine, "apart", lambda clusters: [[], [], clusters])
+    np.testing.assert_allclose(parted.quat, at(path, pieces).quat, rtol=0, atol=1e-13)
+
+
+def test_parts_share_no_pose_and_slices_out_of_order_are_not_parted() -> None:
+    def seen(*numbers: int) -> list[npt.NDArray[np.void]]:
+        found = []
+        for number in numbers:
+            some = np.zeros(3, CLUSTER_DTYPE)
+            some["time_ns"] = START_NS + number * SLICE_NS + np.array([0, SLICE_NS // 2, SLICE_NS])
+            found.append(some)
+        return found
+
+    slices = seen(0, 1, 2, 3, 4)
+    assert [list(map(id, part)) for part in apart(slices)] == [
+        list(map(id, part)) for part in (slices[:2], slices[3:], slices[2:3])
+    ]
+    for some in (seen(0, 3, 2, 1, 4), seen(0, 1, 1, 1, 2), seen(0, 1), seen()):
+        assert [len(part) for part in apart(some)] == [0, 0, len(some)]
 
 
 def test_where_the_lidar_sees_nothing_the_path_stays(true: Path, pieces: list[Slice]) -> None:
