@@ -140,12 +140,16 @@ def _why_none(path: Path) -> str:
 
 
 def _points(cloud: reader.Cloud, week: int | None, progress: Progress) -> tuple[npt.NDArray[np.int64], Array]:
-    """Times and places of what moved, in the order of time."""
+    """Times and places of what moved, in the order of time; nobody is asked for the week of a cloud without any."""
     times, places = [np.empty(0, np.int64)], [np.empty((0, 3))]
-    for chunk in reader.chunks(cloud, Clock(week), ("classification",)):
+    clock = Clock(week)
+    for chunk in reader.chunks(cloud, columns=("classification",)):
         some = chunk.points.columns.get("classification", np.zeros(len(chunk.points), np.uint8)) == MOVING
-        times.append(chunk.points.time_ns[some])
-        places.append(chunk.points.xyz_m[some])
+        time_s = np.asarray(chunk.record.gps_time, np.float64)
+        clock = clock.begun(time_s) if cloud.week_time else clock
+        if some.any():
+            times.append(clock.utc_ns(cloud.path, cloud.week_time, time_s[some]))
+            places.append(chunk.points.xyz_m[some])
         progress(len(some))
     time_ns, xyz = np.concatenate(times), np.concatenate(places)
     order = np.argsort(time_ns, kind="stable")

@@ -44,6 +44,8 @@ _CELLS: Final = (3.0, 10.0)
 """Cells in a patch's side, at least and at most."""
 _FEWEST: Final = 10.0
 """Points of ground on a patch, below which heights are not known well enough."""
+_LEAST_ON_PATCH: Final = 0.1
+"""As few are refused: cells of a raster over such a cloud are nearly all empty."""
 _STANDING_M: Final = 3.0
 """What stands lower than this above the ground, and is none: walls, shrubs, cars, branches. Its foot passes for ground ..."""
 _BESIDE_M: Final = 0.5
@@ -195,6 +197,13 @@ def _ground(
     if not counts.all():
         raise CoverageError(
             f"{task.cloud}: no point of it lies on the ground of {clouds[0].path}; are they of one place?"
+        )
+    wide = np.unique(((squares >> 35) << 32) + ((squares & 0xFFFFFFFF) >> 3))
+    on_patch = float(counts.min()) / (64.0 * len(wide)) * task.size_m**2
+    if on_patch < _LEAST_ON_PATCH:
+        raise CoverageError(
+            f"{task.cloud}: {on_patch:.2g} points of ground on a patch of {task.size_m:g} m, expected {_LEAST_ON_PATCH:g} or more; larger "
+            "ones are found, see --size"
         )
     made.ground_points, made.density_m2 = int(counts.sum()), float(counts.min() / max(len(squares), 1))
     most, least = (task.size_m / each for each in _CELLS)

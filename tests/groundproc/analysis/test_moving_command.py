@@ -144,3 +144,20 @@ def test_what_cannot_be_is_one_sentence(
     assert said in err
     assert "\n" not in err
     assert not (tmp_path / "m.geojson").exists()
+
+
+def test_nobody_is_asked_for_the_week_of_a_cloud_without_anything_that_moved(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = write_cloud(tmp_path / "c.laz", np.random.default_rng(0).uniform(0, 9, (500, 3)))
+    las = laspy.read(cloud)
+    las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType.WEEK_TIME
+    las.gps_time = np.linspace(1000.0, 1010.0, 500)
+    las.write(cloud)
+    words = ["moving", str(cloud), "-o", str(tmp_path / "m.geojson"), "--force"]
+    assert main(words) == 0
+    assert "no point of class 69" in capsys.readouterr().err
+    las.classification[:50] = 69
+    las.write(cloud)
+    assert main(words) == 1
+    assert "give the week with --week" in capsys.readouterr().err

@@ -120,3 +120,11 @@ def test_on_a_village_where_nobody_dug_claims_are_rare(tmp_path: Path) -> None:
     assert main(["soil", str(cloud), "-o", str(tmp_path / "s.geojson"), "--json", str(tmp_path / "f.json")]) == 0
     # walls, shrubs and crowns have feet that pass for ground: 6 in 100 m2 where they count
     assert json.loads((tmp_path / "f.json").read_text())["patches"] / (side_m**2 / 100.0) < 0.15
+
+
+def test_a_cloud_with_hardly_a_point_on_a_patch_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rasters of a decimetre over two square kilometres took minutes and gigabytes, to say nothing."""
+    xy = np.random.default_rng(0).uniform(0, 1500.0, (6280, 2))
+    cloud = write_cloud(tmp_path / "c.laz", np.column_stack([xy, 0.01 * xy[:, 0]]))
+    assert main(["soil", str(cloud), "-o", str(tmp_path / "s.geojson")]) == 1
+    assert "points of ground on a patch of 0.5 m, expected 0.1 or more" in capsys.readouterr().err
