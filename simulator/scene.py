@@ -28,7 +28,7 @@ from simulator.natural import bank, bare_field, crops, meadow, slope
 from simulator.parts import Parts, World
 from simulator.quarry import quarry
 from simulator.route import Route, eights
-from simulator.street import empty_street, facades
+from simulator.street import empty_street, facades, yard_street
 from simulator.town import town
 from simulator.wood import wood
 
@@ -220,6 +220,7 @@ SCENES: Final[dict[str, tuple[Callable[[np.random.Generator], Place], Mount]]] =
     "bank": (bank, Mount()),
     "quarry": (quarry, Mount()),
     "emptystreet": (empty_street, Mount()),
+    "yardstreet": (yard_street, Mount()),
 }
 
 

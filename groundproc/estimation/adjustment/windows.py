@@ -14,6 +14,7 @@ import numpy.typing as npt
 from flightlog import frames
 from groundproc.estimation.adjustment.batch import DRAWS, Batch
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
+from groundproc.estimation.adjustment.loops import closed_loops
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
 from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
@@ -116,6 +117,10 @@ class Window:
         Noise of the turns of the gyro that carries the motion, as learnt [rad/sqrt(s)].
     datum : ndarray, shape (6, 6)
         Of the shift and the turn about the origin that the whole window shares.
+    loops : list of dict
+        Places that it came back to metres beside itself, and was laid on, for the report.
+    beside : int
+        Pieces that lie beside what was seen there before, and were not found on it.
     """
 
     first: int
@@ -134,6 +139,8 @@ class Window:
     correlation: Array = field(default_factory=lambda: np.zeros((0, SIZE, SIZE)))
     density: float = 0.0
     datum: Array = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
+    loops: list[dict[str, float]] = field(default_factory=list)
+    beside: int = 0
 
 
 @dataclass(slots=True)
@@ -168,6 +175,8 @@ def adjust_window(
         common = slice((first - previous.first) * STEPS, (first - previous.first + OVERLAP) * STEPS, STEPS)
         tie = Tie(previous.path.quat[common], previous.path.position_m[common])
         path = _laid_on(path, tie)
+    loops = closed_loops(path, track, first, last)
+    path = loops.path
     mat, lever = sources.mat_ins_lidar, sources.lever_m
     bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
     unheld_m = np.array(track.unheld_m[first:last])
@@ -201,7 +210,7 @@ def adjust_window(
     return Window(
         first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
         batch.log, exact, corrections, batch.said(), seen, errors.correlation,
-        carried_density(observations, motion.rate_density), posterior.datum(),
+        carried_density(observations, motion.rate_density), posterior.datum(), loops.closed, loops.apart,
     )  # fmt: skip
 
 
