@@ -223,6 +223,16 @@ def test_in_the_empty_street_nothing_stands_between_the_walls():
     assert 28.0 <= np.ptp(walls[..., 1]) <= 34.0
 
 
+def test_the_yard_lies_before_the_street_and_is_come_back_to():
+    built = scene("yardstreet", 7)
+    facades = np.array([name.startswith("facade") for name in built.world.names])[built.world.surface]
+    houses = np.array([name.startswith("house") for name in built.world.names])[built.world.surface]
+    assert built.world.triangles_m[houses][..., 0].max() < built.world.triangles_m[facades][..., 0].min()
+    points = np.array(built.route.points_m)
+    assert np.linalg.norm(points[0] - points[-1]) < 5.0
+    assert np.ptp(points[:, 0]) > 300.0
+
+
 def test_an_avenue_runs_as_the_seed_has_it_and_is_driven_at_the_height_of_a_roof():
     for seed in (1, 2):
         built = scene("avenue", seed)

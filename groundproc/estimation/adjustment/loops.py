@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from flightlog import frames
 from groundproc.estimation.observations.planes import placed
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
-from groundproc.estimation.odometry.laying import Laid, Target
+from groundproc.estimation.odometry.laying import Flags, Laid, Target
 from groundproc.estimation.odometry.odometry import Odometry
-from groundproc.estimation.odometry.relocation import FEWEST_ON, LEAST_SHARE, RADIUS_M, laid
+from groundproc.estimation.odometry.relocation import FEWEST_ON, LEAST_SHARE, RADIUS_M, SURER, laid, surer
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.surfaces import FILLED, GROUND, STANDING, Surfaces, surfaces_of, thinned
 from groundproc.estimation.odometry.track import Track
@@ -129,11 +129,12 @@ class _Pieces:
             if seen is None:
                 continue
             mine, theirs = self.several(number - BESIDE, number), self.several(seen - BESIDE, seen + BESIDE)
-            if _agree(mine, theirs, self.middle_m[number]):
+            as_it_is = _apart(mine, theirs, self.middle_m[number])
+            if as_it_is is None:
                 last = None
                 continue
             found = laid(mine, theirs, self.middle_m[number], self._drift(seen, number))
-            if found is not None and found.off(_as_it_is(found), 10.0) > LEAST_M:
+            if found is not None and _is_better(found, as_it_is):
                 if last is not None and last[0] == number - 1 and found.off(last[1], 10.0) < ALIKE_M:
                     return seen, number - 1, found
                 last = number, found
@@ -157,17 +158,19 @@ class _Pieces:
         return np.asarray(np.hypot(grown, np.array([own, own, own, turned])))
 
 
-def _agree(mine: Surfaces, theirs: Surfaces, about_m: Array) -> bool:
-    """Whether both show the same as they lie, or too little to say."""
+def _apart(mine: Surfaces, theirs: Surfaces, about_m: Array) -> Flags | None:
+    """Which points of what stands lie on surfaces as it is; None where most do, or where too little is seen to say."""
     mine = thinned(mine.near(about_m, RADIUS_M))
     if min((mine.kind != GROUND).sum(), np.isin(theirs.kind, (STANDING, FILLED)).sum()) < FEWEST_ON:
-        return True
+        return None
     on, known = Target(theirs).agreement(mine)
-    return bool(known.sum() < FEWEST_ON or on.sum() >= LEAST_SHARE * known.sum())
+    return None if known.sum() < FEWEST_ON or on.sum() >= LEAST_SHARE * known.sum() else on
 
 
-def _as_it_is(found: Laid) -> Laid:
-    return replace(found, mat=np.eye(3), shift_m=np.zeros(3))
+def _is_better(found: Laid, as_it_is: Flags) -> bool:
+    """Whether a place is another one, and far more points speak for it than for that where it lies."""
+    stays = replace(found, mat=np.eye(3), shift_m=np.zeros(3))
+    return found.off(stays, 10.0) > LEAST_M and surer(found.on, as_it_is) > SURER
 
 
 def _shares(unheld_m: Array, seen: int, begin: int) -> Array:

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.estimation.odometry.laying import INFLATION, Laid, Target
+from groundproc.estimation.odometry.laying import INFLATION, Flags, Laid, Target
 from groundproc.estimation.odometry.seeking import starts
 from groundproc.estimation.odometry.surfaces import FILLED, GROUND, STANDING, Surfaces, thinned
 
@@ -76,20 +76,20 @@ def _chosen(found: list[Laid], reach: Array) -> Laid | None:
         return None
     best = max(found, key=lambda each: int(each.on.sum()))
     others = [each for each in found if best.off(each, RADIUS_M / 3.0) > APART_M]
-    surer = min((_surer(best, each) for each in others), default=np.inf)
+    surest = min((surer(best.on, each.on) for each in others), default=np.inf)
     sigma, on = np.sqrt(np.diag(best.covariance)), int(best.on.sum())
     good = (
         on >= FEWEST_ON
         and on >= LEAST_SHARE * best.known.sum()
-        and surer > SURER
+        and surest > SURER
         and sigma[3:].max() < HELD_M
         and sigma[:3].max() < HELD_RAD
         and (np.abs(best.shift_m) <= reach[:3]).all()
     )
-    return replace(best, covariance=best.covariance + np.diag(FLOOR**2), surer=surer) if good else None
+    return replace(best, covariance=best.covariance + np.diag(FLOOR**2), surer=surest) if good else None
 
 
-def _surer(one: Laid, other: Laid) -> float:
-    """By how many sigmas of chance more points speak for one place than for another; neighbours share their errors."""
-    for_one, for_other = int((one.on & ~other.on).sum()), int((other.on & ~one.on).sum())
+def surer(one: Flags, other: Flags) -> float:
+    """By how many sigmas of chance more points lie on surfaces at one of two places than at the other; neighbours share their errors."""
+    for_one, for_other = int((one & ~other).sum()), int((other & ~one).sum())
     return (for_one - for_other) / float(np.sqrt(INFLATION * max(for_one + for_other, 1)))
