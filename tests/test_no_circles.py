@@ -1,6 +1,7 @@
 """No file imports itself by way of others, be it inside a function or for types only."""
 
 import ast
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -20,16 +21,22 @@ def modules(root: Path) -> dict[str, Path]:
     return found
 
 
+@cache
+def imports(path: Path) -> list[ast.Import | ast.ImportFrom]:
+    """All statements of a file that import something, wherever they stand."""
+    return [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
 def imported(path: Path, known: dict[str, Path]) -> set[str]:
     """Files of ours that a file names, wherever the import stands.
 
     What a package only hands on counts as an import of the file itself: `from room import file`.
     """
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in imports(path):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        elif node.module and not node.level:
             files = {f"{node.module}.{alias.name}" for alias in node.names} & known.keys()
             names.update(files)
             if len(files) < len(node.names):
@@ -52,7 +59,7 @@ def test_no_import_goes_by_dots() -> None:
     dotted = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for path in modules(ROOT).values()
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in imports(path)
         if isinstance(node, ast.ImportFrom) and node.level
     ]
     assert dotted == []

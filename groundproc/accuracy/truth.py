@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from flightlog import config
 from flightlog.constants import HOUR_NS
@@ -170,20 +169,10 @@ def shot_numbers(
     start_ns : int
         Lidar time of the flight's first shot.
     """
-    numbers = np.empty(len(time_ns), np.int64)
     lidar = sensors.lidar(sensors.FLOWN)  # which is what the simulator simulates
-    _number(time_ns, laser, rank, start_ns, len(lidar.lasers), lidar.firing_ns, lidar.laser_ns, numbers)
-    return numbers
-
-
-@njit(cache=True, nogil=True)
-def _number(
-    time_ns: Any, laser: Any, rank: Any, start_ns: int, lasers: int, firing_ns: int, laser_ns: int, out: Any
-) -> None:
-    for i in range(len(time_ns)):
-        late_ns = time_ns[i] - start_ns - np.int64(laser[i]) * laser_ns
-        firing = (late_ns + firing_ns // 2) // firing_ns
-        out[i] = (firing * lasers + np.int64(laser[i])) * 2 + np.int64(rank[i])
+    late_ns = time_ns - start_ns - laser.astype(np.int64) * lidar.laser_ns
+    firing = (late_ns + lidar.firing_ns // 2) // lidar.firing_ns
+    return (firing * len(lidar.lasers) + laser) * 2 + rank.astype(np.int64)
 
 
 class Hits:

@@ -191,10 +191,10 @@ def _fast(z: Any, sight: Sight, eye: float, out: npt.NDArray[np.uint8]) -> None:
     beside = np.full(z.T.shape, UNKNOWN, np.uint8)
     z_turned = np.ascontiguousarray(z.T)
     for step in (-1, 1):
-        _wedge(z, sight, eye, (*centre, step), out)
-        _wedge(z_turned, turned, eye, (centre[1], centre[0], step), beside)
+        _wedge(z, sight, eye, True, (*centre, step), out)
+        _wedge(z_turned, turned, eye, True, (centre[1], centre[0], step), beside)
     _merge(out, beside, centre)
-    _near(z, sight, eye, centre, out)
+    _near(z, sight, eye, True, centre, out)
 
 
 @njit(cache=True, nogil=True)
@@ -210,14 +210,14 @@ def _merge(out: Any, beside: Any, centre: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _near(z: Any, sight: Any, eye: float, centre: Any, out: Any) -> None:
+def _near(z: Any, sight: Any, eye: float, gaps: bool, centre: Any, out: Any) -> None:
     for j in range(max(centre[1] - _NEAR, 0), min(centre[1] + _NEAR, z.shape[0] - 1) + 1):
         for i in range(max(centre[0] - _NEAR, 0), min(centre[0] + _NEAR, z.shape[1] - 1) + 1):
-            out[j, i] = _line(z, sight, eye, True, i, j)
+            out[j, i] = _line(z, sight, eye, gaps, i, j)
 
 
 @njit(cache=True, nogil=True)
-def _wedge(z: Any, sight: Any, eye: float, run: Any, out: Any) -> None:  # noqa: C901 (a kernel: calls would cost)
+def _wedge(z: Any, sight: Any, eye: float, gaps: bool, run: Any, out: Any) -> None:  # noqa: C901 (a kernel: calls would cost)
     """Row by row away from the observer, each as wide as it is far; of the horizon only that of the row before is kept.
 
     The horizon of a cell is the slope that it must reach, the cell itself left out; slopes are by rows, not by the way along the line.
@@ -273,7 +273,7 @@ def _wedge(z: Any, sight: Any, eye: float, run: Any, out: Any) -> None:  # noqa:
             horizon[k] = most
             over = z_far[k] + target - bend - eye - most * far
             if abs(over) < unsure * apart:
-                seen[k] = _line(z, sight, eye, True, k, row)
+                seen[k] = _line(z, sight, eye, gaps, k, row)
             else:
                 seen[k] = UNKNOWN if over != over else VISIBLE if over >= -_SLACK_M else HIDDEN
         before, horizon = horizon, before

@@ -5,6 +5,7 @@ splines     uniform cubic B-splines
 robust      the sigma that a median tells, and weights of losses that bend
 voxelhash   keys of voxels, and points sorted by them
 planes      planes through the second moments of points
+layout      arrays as kernels take them, of one type whatever the caller has
 memory      arrays whose memory is used again
 planerows   distances from such planes as rows of a least-squares problem, the planes solved for within
 planeproducts  the normal matrix of such rows times vectors

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from groundproc.numerics.layout import to_read
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Grid, Window
 
@@ -22,7 +23,7 @@ def bilinear(values: npt.NDArray[np.float32], grid: Grid, xyz_m: Array) -> npt.N
     grid : Grid
     xyz_m : ndarray, shape (n, 2 or 3)
     """
-    return np.asarray(_bilinear(values, grid.west_m, grid.north_m, grid.cell_m, xyz_m))
+    return np.asarray(_bilinear(to_read(values), grid.west_m, grid.north_m, grid.cell_m, to_read(xyz_m)))
 
 
 @njit(cache=True, nogil=True)

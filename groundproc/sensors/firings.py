@@ -11,6 +11,7 @@ import numpy.typing as npt
 from numba import njit
 
 from flightlog.hdl32e import AZIMUTH_STEPS, BLOCK_DTYPE, BLOCKS, RANGE_LSB_M
+from groundproc.numerics.layout import to_read
 from groundproc.numerics.memory import Pool
 from groundproc.sensors.blocks import Packets, Times, is_dual, limits, raw_bytes
 from groundproc.sensors.shots import FIRST_OF_TWO, SINGLE_RETURN, Gate, Gated, LaserTable, Shots
@@ -75,7 +76,7 @@ def decode(firing: Firing, packets: Packets, time_ns: Times, gate: Gate | None, 
     kernel = _decode_dual if is_dual(packets) else _decode_single
     table = np.ascontiguousarray(lasers.kernel_rows()[:, firing.laser])
     timing = _Timing(firing.block_ns, firing.offset_ns, firing.offset_ns / firing.block_ns, firing.laser)
-    count = kernel(raw, head, time_ns, table, timing, limits(gate or Gate()), out, counters)
+    count = kernel(to_read(raw), head, to_read(time_ns), table, timing, limits(gate or Gate()), out, counters)
     return Shots(
         out.time_ns[:count],
         out.xyz_m[:count],

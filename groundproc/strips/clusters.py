@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from groundproc.numerics.layout import to_read
 from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
@@ -64,7 +65,7 @@ class Gatherer:
         found = _gather(
             order,
             keys,
-            _Points(time_ns, xyz_m, sensor_m, quat, strip),
+            _Points(*(to_read(each) for each in (time_ns, xyz_m, sensor_m, quat, strip))),
             _Columns(*(out[name] for name in CLUSTER.names or ())),
         )
         self._parts.append(out[:found].copy())

@@ -17,6 +17,7 @@ from numba import njit
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.geodesy import LocalFrame
+from groundproc.numerics.layout import to_read
 from groundproc.numerics.rotations import quat_difference, quat_turned
 from groundproc.trajectory.covariance import Correlation, chained, scaled, uncorrelated
 
@@ -114,7 +115,8 @@ class Trajectory:
         position, quat = np.empty((len(times), 3)), np.empty((len(times), 4))
         covered = np.zeros(len(times), np.bool_)
         knots = _Knots(
-            self.time_ns, self.covered, self.position_m, self.velocity_m_s, self.quat_local_ins_wxyz, self.rate_rad_s
+            *map(to_read, (self.time_ns, self.covered, self.position_m, self.velocity_m_s)),
+            *map(to_read, (self.quat_local_ins_wxyz, self.rate_rad_s)),
         )
         _interpolate(knots, self.interpolation == HOLD, times, position, quat, covered)
         return Poses(position, quat), covered

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+import tied
 from scipy.stats import chi2
 
 from flightlog.logfile import LogReader
 from flightlog.logwriter import LogWriter
+from flightlog.records import LIDAR
 from groundproc.accuracy.judge import judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
@@ -20,7 +22,6 @@ from groundproc.estimation.adjustment import adjusted, windows
 from groundproc.estimation.method import gather
 from groundproc.estimation.odometry.track import Track
 from groundproc.flight.flight import read_flight
-from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 
@@ -55,24 +56,39 @@ def hovers(simulated: Callable[..., Any]) -> list[Any]:
 
 
 def judged(
-    folder: Path, survey: Survey, log: Path | None = None, *, cloud: bool = False, solved: Estimate | None = None
+    folder: Path, survey: Survey, log: Path | None = None, *, cloud: Path | None = None, solved: Estimate | None = None
 ) -> Judged:
-    """Estimate where it is not solved yet, and compare with the truth as the benchmark does."""
+    """Estimate where it is not solved yet, and compare with the truth as the benchmark does; a cloud by a log of its scans."""
     truth = read_truth(folder)
-    with LogReader(log or truth.log) as reader:
+    with LogReader(log or truth.log) as reader, LogReader(cloud or truth.log) as scans:
         read = read_flight([reader], "ins")
-        timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+        timeline = tied.timeline(log or truth.log, read, truth.nominal_mount.mat_ins_lidar())
         given = gather([reader], read, timeline, truth.nominal_mount, survey)
         made = solved or methods.estimate(given, lambda stage, size: None)
         placed = on_lidar_clock(made.trajectory, timeline[0].lidar_line, truth)
         lasers = made.corrections.table(read.lidar.lasers)
-        found = judge([reader] if cloud else [], truth, placed, made.mount, lasers)
+        found = judge([scans] if cloud else [], truth, placed, made.mount, lasers)
     return Judged(made, found.figures, given.fixes[0].sigma_m.max(axis=0))
 
 
 @pytest.fixture(scope="module")
-def whole(flight: Any, adjustment: Callable[[Any], Estimate]) -> Judged:
-    return judged(flight.folder, Survey(), cloud=True, solved=adjustment(flight))
+def scans(flight: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A third of its revolutions, whole ones from the first to the last: how thick the cloud is, millions of its points tell as well."""
+    path: Path = tmp_path_factory.mktemp("scans") / "flight.mcap"
+    seen = 0
+    with LogReader(flight.log) as reader, path.open("wb") as stream:
+        writer = LogWriter(stream, metadata=dict(reader.metadata), attachments=dict(reader.attachments))
+        for message in reader.messages():
+            seen += message.topic == LIDAR.topic
+            if message.topic != LIDAR.topic or seen % 3 == 0:
+                writer.write(message.topic, message.log_time_ns, bytes(message.data))
+        writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(flight: Any, scans: Path, adjustment: Callable[[Any], Estimate]) -> Judged:
+    return judged(flight.folder, Survey(), cloud=scans, solved=adjustment(flight))
 
 
 @pytest.fixture(scope="module")
@@ -159,10 +175,10 @@ def test_no_sigma_is_below_what_noise_allows_nor_above_what_was_known_before(fli
     assert np.square(off).sum() < chi2.ppf(0.9995, 3)
 
 
-def test_the_same_flight_in_windows_is_as_good(flight: Any, whole: Judged) -> None:
+def test_the_same_flight_in_windows_is_as_good(flight: Any, scans: Path, whole: Judged) -> None:
     """Five windows of 6 s with 2 s in common: the same path, on the same place, and a cloud as thin."""
     with short_windows(60, 20) as held:
-        made = judged(flight.folder, Survey(method="adjusted"), cloud=True)
+        made = judged(flight.folder, Survey(method="adjusted"), cloud=scans)
     assert len(made.estimate.report["windows"]) == len(held) >= 4
     # memory: a window's clusters and no more, however many windows there were before
     assert max(held) <= 60
@@ -268,7 +284,7 @@ def test_a_track_of_a_second_is_refused(flight: Any, tmp_path: Path) -> None:
     truth = read_truth(flight.folder)
     with LogReader(log) as reader:
         read = read_flight([reader], "ins")
-        timeline = legs(read.runs, read.boots, truth.nominal_mount.mat_ins_lidar(), "auto")
+        timeline = tied.timeline(log, read, truth.nominal_mount.mat_ins_lidar())
         given = gather([reader], read, timeline, truth.nominal_mount, Survey())
         made = methods.estimate(given, lambda stage, size: None)
         assert made.method == "filtered"

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 import pytest
+import tied
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -23,7 +24,6 @@ from groundproc.estimation import methods
 from groundproc.estimation.adjustment import adjusted, windows
 from groundproc.estimation.method import Given, gather
 from groundproc.flight.flight import read_flight
-from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 
@@ -45,7 +45,7 @@ def given_of(truth: Truth, survey: Survey) -> Iterator[Given]:
     with LogReader(truth.log) as reader:
         read = read_flight([reader], "ins")
         mount = replace(truth.nominal_mount, gps_position_m=tuple(ANTENNA.tolist()))
-        timeline = legs(read.runs, read.boots, mount.mat_ins_lidar(), "auto")
+        timeline = tied.timeline(truth.log, read, mount.mat_ins_lidar())
         yield gather([reader], read, timeline, mount, survey)
 
 

@@ -288,9 +288,10 @@ def _back(
             congruent(n, dt, couple, keep, True)
 
 
-@njit(cache=True, nogil=True)
 def smooth(motion: Motion, rows: Rows, start: Array, start_covariance: Array, out: Smoothed) -> float:
     """Filter forward, smooth back.
+
+    No kernel itself: all others would be compiled into it once more, a quarter of the smoother's time, for one call a block.
 
     Parameters
     ----------

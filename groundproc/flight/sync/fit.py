@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.interpolate import CubicSpline
-from scipy.sparse.linalg import factorized
+from scipy.sparse.linalg import splu
 
 from flightlog.constants import NS_PER_S
 from flightlog.errors import SyncError
@@ -55,7 +55,7 @@ def fit(lidar: GyroTrack, ins: GyroTrack, peak: Peak, cutoff_hz: float, mat_moun
         residual = unbias(rate - turned)
         axes = np.eye(3)
         columns = [-moved, -moved * (time_s - mid_s)[:, None], *(np.cross(axis, turned) for axis in axes)]
-        jacobian = np.stack([unbias(column) for column in columns], axis=-1)
+        jacobian = unbias(np.concatenate(columns, axis=1)).reshape(len(time_s), len(columns), 3).swapaxes(1, 2)
         weight, curvature = _weights(residual, moved)
         normal = np.einsum("nki,nk,nkj->ij", jacobian, weight, jacobian) + np.diag(prior)
         score = np.einsum("nki,nk,nk->i", jacobian, weight, residual)
@@ -91,7 +91,7 @@ def fit(lidar: GyroTrack, ins: GyroTrack, peak: Peak, cutoff_hz: float, mat_moun
 
 
 def _bias_projector(time_s: Array) -> Callable[[Array], Array]:
-    """A function that takes from each axis, shape (n, 3), its best linear spline with knots `BIAS_KNOT_S` apart."""
+    """A function that takes from each column, shape (n, k), its best linear spline with knots `BIAS_KNOT_S` apart."""
     span = time_s[-1] - time_s[0]
     knots = max(2, round(span / BIAS_KNOT_S) + 1)
     place = (time_s - time_s[0]) / span * (knots - 1)
@@ -105,11 +105,11 @@ def _bias_projector(time_s: Array) -> Callable[[Array], Array]:
         shape=(len(time_s), knots),
     )
     # the small ridge is for knots in a silence, which no sample sees
-    solve = factorized(sparse.csc_matrix(basis.T @ basis + 1e-6 * sparse.identity(knots)))
+    factors = splu(sparse.csc_matrix(basis.T @ basis + 1e-6 * sparse.identity(knots)))
+    across = sparse.csr_matrix(basis.T)
 
     def unbias(values: Array) -> Array:
-        fitted = np.stack([solve(basis.T @ axis) for axis in values.T], axis=1)
-        return np.asarray(values - basis @ fitted)
+        return np.asarray(values - basis @ factors.solve(across @ values))
 
     return unbias
 

@@ -113,16 +113,15 @@ def test_the_smoother_is_least_squares(block: int, monkeypatch: pytest.MonkeyPat
         np.empty((NODES, 9, 9), np.float32),
     )
     monkeypatch.setattr(kalman, "BLOCK", block)
-    smooth = kalman.smooth if block == 400 else kalman.smooth.py_func
-    if block != 400:
+    if block != 400:  # a constant is compiled in
         for name in ("_forward", "_record", "_back"):
             monkeypatch.setattr(kalman, name, getattr(kalman, name).py_func)
     keep = np.tile(KEEP, (NODES - 1, 1))
     # arrays laid out as the method's own are: for others the whole smoother would be compiled once more
-    step_s, between = np.full(NODES - 1, STEP_S), np.asfortranarray(push)
-    motion = Motion(*reference, step_s, angle, push, between, *densities, GRAVITY, keep, drive)
+    step_s = np.full(NODES - 1, STEP_S)
+    motion = Motion(*reference, step_s, angle, push, push, *densities, GRAVITY, keep, drive)
     out = kalman.Smoothed(1, correction, residual, kept, kept_covariance, variance)
-    smooth(motion, kalman.Rows(first, *rows), start, covariance, out)
+    kalman.smooth(motion, kalman.Rows(first, *rows), start, covariance, out)
     # all states of all nodes as one Gaussian vector, conditioned on all measurements at once
     noise = drive * STEP_S
     noise[3:6], noise[6:9] = densities[1][0] * STEP_S, densities[0][0] * STEP_S
