@@ -53,9 +53,10 @@ $(VENV)/.python: $(VENV)/.apt
 	done; echo "no Python of 3.11 or newer with venv was found" >&2; exit 1
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@# --no-compile: of 17,000 modules, a minute and more of one core, a run imports a part, and compiles that by itself
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
 	@# a test lets MAVProxy show our messages; what it would bring along (vtk, opencv) is not needed for that
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
 	@touch $@
 
 $(VENV)/.warm: $(VENV)/.installed

@@ -65,7 +65,7 @@ class Gatherer:
         found = _gather(
             order,
             keys,
-            _Points(*(to_read(each) for each in (time_ns, xyz_m, sensor_m, quat, strip))),
+            _Points(to_read(time_ns), to_read(xyz_m), to_read(sensor_m), to_read(quat), to_read(strip)),
             _Columns(*(out[name] for name in CLUSTER.names or ())),
         )
         self._parts.append(out[:found].copy())
