@@ -112,14 +112,12 @@ class Trajectory:
         Any order will do; time order is fastest.
         """
         times = np.ascontiguousarray(time_ns, np.int64)
-        position, quat = np.empty((len(times), 3)), np.empty((len(times), 4))
-        covered = np.zeros(len(times), np.bool_)
-        knots = _Knots(
-            *map(to_read, (self.time_ns, self.covered, self.position_m, self.velocity_m_s)),
-            *map(to_read, (self.quat_local_ins_wxyz, self.rate_rad_s)),
-        )
-        _interpolate(knots, self.interpolation == HOLD, times, position, quat, covered)
-        return Poses(position, quat), covered
+        quat, rate = to_read(self.quat_local_ins_wxyz), to_read(self.rate_rad_s)
+        place, velocity = to_read(self.position_m), to_read(self.velocity_m_s)
+        knots = _Knots(to_read(self.time_ns), to_read(self.covered), place, velocity, quat, rate)
+        poses, covered = Poses(np.empty((len(times), 3)), np.empty((len(times), 4))), np.zeros(len(times), np.bool_)
+        _interpolate(knots, self.interpolation == HOLD, times, poses.position_m, poses.quat_local_ins_wxyz, covered)
+        return poses, covered
 
     def at(self, time_ns: npt.NDArray[np.int64]) -> Poses:
         """Poses at times, shape (n,).

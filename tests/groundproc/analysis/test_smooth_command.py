@@ -34,10 +34,17 @@ class Place:
         self.true.append(true)
         self.normal.append(np.broadcast_to(normal, true.shape))
 
-    def plane(self, name: str, corner: tuple[float, ...], along: tuple[float, ...], up: tuple[float, ...]) -> None:
+    def plane(
+        self,
+        name: str,
+        corner: tuple[float, ...],
+        along: tuple[float, ...],
+        up: tuple[float, ...],
+        per_m2: float = PER_M2,
+    ) -> None:
         across = np.cross(along, up)
         area = float(np.linalg.norm(across))
-        at = self.rng.random((int(area * PER_M2), 2))
+        at = self.rng.random((int(area * per_m2), 2))
         self.add(name, np.array(corner) + at[:, :1] * along + at[:, 1:] * up, across / area)
 
     def pole(self, name: str, foot: tuple[float, float], radius_m: float) -> None:
@@ -51,7 +58,8 @@ class Place:
 
 def village() -> Place:
     place = Place()
-    place.plane("ground", (0, 0, 0), (14, 0, 0), (0, 12, 0))
+    # most of the area, of which little is asked
+    place.plane("ground", (0, 0, 0), (14, 0, 0), (0, 12, 0), PER_M2 / 2)
     place.plane("kerb", (0, 12, 0.12), (14, 0, 0), (0, 2, 0))
     place.plane("wall", (4, 4, 0), (6, 0, 0), (0, 0, 3))
     place.plane("gable", (4, 4, 0), (0, 6, 0), (0, 0, 3))
