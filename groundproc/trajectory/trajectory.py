@@ -116,7 +116,9 @@ class Trajectory:
         place, velocity = to_read(self.position_m), to_read(self.velocity_m_s)
         knots = _Knots(to_read(self.time_ns), to_read(self.covered), place, velocity, quat, rate)
         poses, covered = Poses(np.empty((len(times), 3)), np.empty((len(times), 4))), np.zeros(len(times), np.bool_)
-        _interpolate(knots, self.interpolation == HOLD, times, poses.position_m, poses.quat_local_ins_wxyz, covered)
+        _interpolate(
+            knots, self.interpolation == HOLD, to_read(times), poses.position_m, poses.quat_local_ins_wxyz, covered
+        )
         return poses, covered
 
     def at(self, time_ns: npt.NDArray[np.int64]) -> Poses:
