@@ -19,7 +19,8 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/pytest
-# A file of tests stays on one worker, so that what its fixtures made is made once; tests/conftest.py has the longest begin.
+# A file of tests stays on one worker, so that what its fixtures made is made once; tests/conftest.py has the longest begin,
+# and says how many workers there are.
 PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup demo static test check soak bench docs deb release clean
