@@ -151,7 +151,7 @@ def form(
     met = np.empty((2 * rays, 2))
     who = np.empty((2 * rays, 2), np.int32)
     for shot in range(shots):
-        count = 0
+        count = np.int64(0)  # of a constant's own type, what takes it would be compiled twice
         for ray in range(shot * rays, (shot + 1) * rays):
             light = 1.0 / rays
             hit_m, cosine = -1.0, 0.0

@@ -202,7 +202,7 @@ class Traffic:
         # feet go to and fro by a fixed stride: they slip a little
         swing = np.sin(2 * np.pi * _STRIDE_HZ * time_s[:, None] + np.arange(len(self)))
         return meet_boxes(
-            firing,
+            np.ascontiguousarray(firing),
             len(origins) // len(firing),
             origins,
             directions,

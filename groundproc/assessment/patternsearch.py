@@ -40,6 +40,7 @@ def candidates(u_m: Array, v_m: Array, value: Array, kind: int, halves_m: Array,
         u, v, turn, half size, and explained over unexplained sum of squares times the number of points.
     """
     found = []
+    u_m, v_m, value = (np.ascontiguousarray(each) for each in (u_m, v_m, value))
     for half in halves_m:
         steps = int(np.ceil(_STEPS * reach_m / half))
         axis = np.linspace(-reach_m, reach_m, 2 * steps + 1)

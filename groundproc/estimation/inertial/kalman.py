@@ -106,7 +106,7 @@ def _predict(k: int, x: Array, p: Array, motion: Motion, couple: Array, defect: 
     forward_rows(x.reshape(STATES, 1), dt, couple, keep)
     for i in range(POSE):
         x[i] += defect[i]
-    congruent(p, dt, couple, keep, False)
+    congruent(p, dt, couple, keep, np.bool_(False))
     for i in range(STATES):
         p[i, i] += drive[i] * dt
     for i in range(3):
@@ -285,7 +285,7 @@ def _back(
             dt, keep = motion.step_s[k - 1], motion.keep[k - 1]
             step(k - 1, motion, couple, defect)
             backward_rows(r.reshape(STATES, 1), dt, couple, keep)
-            congruent(n, dt, couple, keep, True)
+            congruent(n, dt, couple, keep, np.bool_(True))
 
 
 def smooth(motion: Motion, rows: Rows, start: Array, start_covariance: Array, out: Smoothed) -> float:

@@ -190,7 +190,10 @@ def backward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def congruent(p: Array, dt: float, couple: Array, keep: Array, back: bool) -> None:
-    """Make of symmetric p, in place: transition @ p @ transition.T, or the same with the transposed transition."""
+    """Make of symmetric p, in place: transition @ p @ transition.T, or the same with the transposed transition.
+
+    Kernels give `back` as `np.bool_`: of a constant's own type, this would be compiled twice.
+    """
     for _ in range(2):
         if back:
             backward_rows(p, dt, couple, keep)
