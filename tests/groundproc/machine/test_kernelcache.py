@@ -141,3 +141,15 @@ def test_processes_that_compile_one_kernel_for_different_arrays_at_once_do_not_m
     )
     done = subprocess.run([sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True)
     assert done.stdout.strip() == f"{[np.dtype(kind).itemsize for kind in kinds]} {len(kinds)}"
+
+
+@pytest.mark.parametrize(("given", "taken"), [(None, kernelcache.OPTIMISES), ("0", "0")])
+def test_how_far_kernels_are_optimised_is_the_users_to_say(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, taken: str
+) -> None:
+    monkeypatch.delenv(kernelcache.OPTIMISES_VARIABLE, raising=False)
+    if given is not None:
+        monkeypatch.setenv(kernelcache.OPTIMISES_VARIABLE, given)
+    line = "import groundproc; from numba import config; print(int(config.OPT))"
+    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [taken]
