@@ -435,7 +435,7 @@ def update(
 ) -> Any:
     """Correct a state by the planes and leaves that clusters lie on.
 
-    No kernel itself: with all that it calls it took as long to compile as the rest of this file, and some 0.3 ms a slice go by here.
+    No kernel itself: with all that it calls it took as long to compile as the rest of this file.
     Gives how many do, their RMS distance from planes, sigmas of the two directions that they tell least of [m], and the covariance.
     """
     quat, position = state.quat, state.position_m
