@@ -25,7 +25,7 @@ PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup demo static test check soak bench docs deb release clean
 
-setup: $(VENV)/.warm
+setup: $(VENV)/.warm $(VENV)/.mavproxy
 
 $(VENV)/.apt: apt-packages.txt
 	@mkdir -p $(VENV)
@@ -56,7 +56,11 @@ $(VENV)/.python: $(VENV)/.apt
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
 	@# --no-compile: of 17,000 modules, a minute and more of one core, a run imports a part, and compiles that by itself
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
-	@# a test lets MAVProxy show our messages; what it would bring along (vtk, opencv) is not needed for that
+	@touch $@
+
+# A test lets MAVProxy show our messages; what it would bring along (vtk, opencv) is not needed for that. It has to be built, and
+# so comes beside the kernels.
+$(VENV)/.mavproxy: $(VENV)/.installed
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
 	@touch $@
 
