@@ -236,7 +236,14 @@ def _interpolate(
             if 0 <= i < last and knots[i + 1] <= t < knots[i + 2]:
                 i += 1
             else:
-                i = min(max(np.searchsorted(knots, t, side="right") - 1, 0), last)
+                # np.searchsorted would have comparisons of complex numbers compiled
+                i, after = 0, last + 1
+                while after - i > 1:
+                    middle = (i + after) // 2
+                    if knots[middle] <= t:
+                        i = middle
+                    else:
+                        after = middle
             quat_difference(quat[i], quat[i + 1], delta)
             # rate of the rotation vector at the end: the inverse right Jacobian, to second order in the step
             w = rate[i + 1]
