@@ -60,7 +60,9 @@ def flown(simulated: Any) -> Any:
     from simulator.config import Options, perfect
 
     options = perfect(Options())
-    return simulated("bag_flight", "village", SECONDS, replace(options, lidar=replace(options.lidar, footprint_mrad=0.0)))
+    return simulated(
+        "bag_flight", "village", SECONDS, replace(options, lidar=replace(options.lidar, footprint_mrad=0.0))
+    )
 
 
 @pytest.fixture(scope="module")
