@@ -12,7 +12,7 @@ _known: dict[Path, list[Leg]] = {}
 
 
 def timeline(log: Path, flight: Flight, mat_ins_lidar: npt.NDArray[np.float64]) -> list[Leg]:
-    """Legs of a flight as it was read from a log that nobody writes any more, by the rotation of its nominal mount."""
+    """Legs of a flight by the rotation of its nominal mount; neither its log nor what was read of it may be changed."""
     if log not in _known:
         _known[log] = legs(flight.runs, flight.boots, mat_ins_lidar, "auto")
     return _known[log]

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-import tied
 from scipy.stats import chi2
 
 from flightlog import frames
@@ -29,6 +28,7 @@ from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, POSIT
 from groundproc.flight import autopilot
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.flight import Flight, read_flight
+from groundproc.flight.pairing import legs
 from groundproc.flight.positions.fixes import OutsideFixes, Tied
 from groundproc.geodesy import LocalFrame
 from groundproc.survey import Survey
@@ -54,7 +54,7 @@ def given_of(log: Path, change: Callable[[Flight], None] | None = None) -> Itera
     with LogReader(log) as reader:
         flight = read_flight([reader], "ins")
         mount = Mount()
-        timeline = tied.timeline(log, flight, mount.mat_ins_lidar())
+        timeline = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), "auto")
         if change is not None:
             change(flight)
         yield gather([reader], flight, timeline, mount, Survey())
@@ -442,7 +442,7 @@ def test_heights_between_poses_hold_though_accelerometers_shake_and_are_two_per_
     with LogReader(flown.log) as reader:
         flight = read_flight([reader], "ins")
         mount = read_truth(flown.folder).nominal_mount
-        timeline = tied.timeline(flown.log, flight, mount.mat_ins_lidar())
+        timeline = legs(flight.runs, flight.boots, mount.mat_ins_lidar(), "auto")
         given = gather([reader], flight, timeline, mount, Survey())
         some = flown.poses[500::1200]
         mat = frames.mat_local_ins(*(np.deg2rad(some[n]) for n in ("heading_deg", "pitch_deg", "roll_deg")))
