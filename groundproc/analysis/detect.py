@@ -99,6 +99,7 @@ def work(task: Task, progress: Progress) -> Made:
     made = Made(points=cloud.points)
     with written_aside(task.output) as aside:
         floor = Floor(cloud, task.output.parent, progress)
+        floor.refuse_thin("objects")
         layers = _counted(task, floor)
         _judge_light(layers, made)
         if task.penetration is not None:

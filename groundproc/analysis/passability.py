@@ -115,6 +115,7 @@ class _Area:
 
     def __init__(self, task: Task, floor: Floor) -> None:
         self.task, self.floor = task, floor
+        floor.refuse_thin("steps and obstacles")
         cell_m = checked_cell(_cell_for(floor.density_m2) if task.cell_m is None else task.cell_m)
         ground, east, north = (Cells(cell_m, {"mean"}) for _ in range(3))
         top, seen = Cells(cell_m, {"max"}), Cells(cell_m, {"count"})

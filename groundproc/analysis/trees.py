@@ -76,6 +76,7 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
     made = Made(points=cloud.points)
     with written_aside(task.output) as aside:
         floor = Floor(cloud, task.output.parent, progress)
+        floor.refuse_thin("trees")
         grid = floor.grid
         side = side_for(cloud.points, (0.0, 0.0), (grid.columns * grid.cell_m, grid.rows * grid.cell_m), _HALO_M)
         tiles = Tiles(task.output.parent, {"above": np.float32}, side, _HALO_M)

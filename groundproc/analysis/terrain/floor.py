@@ -95,6 +95,18 @@ class Floor:
         found = density_of(xyz for _, xyz, _ in self.pieces())
         return found if found < SPARSE_M2 else None
 
+    def refuse_thin(self, wanted: str) -> None:
+        """Refuse a cloud that is too sparse for small cells over its whole area.
+
+        Raises
+        ------
+        CoverageError
+        """
+        if self.density_m2 < SPARSE_M2:
+            raise CoverageError(
+                f"{self.cloud.path}: {self.density_m2:.2g} points on a square metre, expected {SPARSE_M2:g} or more to look for {wanted}"
+            )
+
     def pieces(self) -> Iterator[tuple[Any, Array, npt.NDArray[np.bool_]]]:
         """Records, their places in metres, and which belong to no surface outdoors: by their class noise, what moved, or behind panes."""
         for chunk in reader.chunks(self.cloud, columns=("classification",)):

@@ -229,6 +229,17 @@ def test_a_cloud_of_a_point_in_hundreds_of_square_metres_has_cells_to_match(tmp_
     assert np.mean(np.asarray(laspy.read(tmp_path / "o.laz").classification) == 2) > 0.95
 
 
+@pytest.mark.parametrize("words", [("detect", "o.geojson"), ("trees", "o.geojson"), ("passability", "o")])
+def test_what_needs_small_cells_refuses_such_a_cloud(
+    words: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    xy = np.random.default_rng(0).uniform(0, 40_000.0, (500, 2))
+    cloud = write_cloud(tmp_path / "c.laz", np.column_stack([xy, np.zeros(500)]))
+    assert main([words[0], str(cloud), "-o", str(tmp_path / words[1])]) == 1
+    assert "points on a square metre, expected 0.0125 or more to look for" in capsys.readouterr().err
+    assert not (tmp_path / words[1]).exists()
+
+
 def test_cells_go_by_the_squares_that_have_points() -> None:
     along = np.linspace(0.0, 40_000.0, 50_000)
     corridor = np.column_stack([along, 0.6 * along + 7.0, np.zeros_like(along)])  # through no corner of squares
