@@ -1,6 +1,6 @@
 """CPU time and errors beside libraries that do the same, one thread each: a part of `uses.py`.
 
-Null where a library is not installed. py4dgeo is beside `swath change --surface` in uses_change.py, GDAL beside `swath viewshed` in
+Left out where a library is not installed, as pgeof, which nothing else needs. py4dgeo is beside `swath change --surface` in uses_change.py, GDAL beside `swath viewshed` in
 uses_sight.py; trees of neighbours are scipy's own.
 
 registration_cpu_s, registration_corner_mm

@@ -22,6 +22,8 @@ _DRAWS, _DRAWN, _JUDGES = 300, 5, 4_000
 """Of groups: with a third of them moved, one draw in eight has none of those."""
 _BEYOND: Final = 3.0
 """Sigmas of a group's own scatter; points further off are none of a draw."""
+_FARTHEST: Final = np.array([3.0, 3.0, 3.0, 2.0, 2.0, 2.0])
+"""Of the prior: no draw takes the whole further. Half of a wave is a plane too, tilted."""
 PRIOR: Final = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.02])
 """What clouds that say where they are may be off by [m, rad]."""
 _GROUP_M: Final = 4.0
@@ -83,14 +85,14 @@ def _rows(
 def step_towards(surface: Surface, other: Surface, moved: Array, matrix: Array, consensus: bool, close: bool) -> Array:
     """One step of shift and turn, [m] and [rad]."""
     group = _groups(moved)
-    said, _ = _rows(surface, other, moved, matrix, group if close else None)
+    said, gone = _rows(surface, other, moved, matrix, group if close else None)
     step = np.asarray(np.linalg.solve(said.hessian + np.eye(6), said.right))
     if consensus:
-        step = _agreed(said, group, np.hypot(other.rough, surface.rough), step)
+        step = _agreed(said, group, np.hypot(other.rough, surface.rough), step, gone)
     return np.asarray(step * PRIOR)
 
 
-def _agreed(said: _Rows, group: npt.NDArray[np.int64], rough: Array, step: Array) -> Array:
+def _agreed(said: _Rows, group: npt.NDArray[np.int64], rough: Array, step: Array, gone: Array) -> Array:
     """The step that fits most points, of one of all and those of a few groups each (always the same draws); in the unit of the rows."""
     order = np.argsort(group, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(group))[:-1])
@@ -101,6 +103,7 @@ def _agreed(said: _Rows, group: npt.NDArray[np.int64], rough: Array, step: Array
     rng = np.random.default_rng(len(parts))
     drawn = rng.integers(len(parts), size=(_DRAWS, _DRAWN))
     steps = np.linalg.solve(hessian[drawn].sum(axis=1) + np.eye(6), right[drawn].sum(axis=1)[:, :, None])[:, :, 0]
+    steps = steps[(np.abs(gone + steps) < _FARTHEST).all(axis=1)]
     some = slice(None, None, max(1, len(group) // _JUDGES))
     steps = np.vstack([step, steps])
     left = (said.over[some, None] + said.rows[some] @ steps.T) / scale[some, None]
