@@ -1,7 +1,7 @@
 """CPU time and errors beside libraries that do the same, one thread each: a part of `uses.py`.
 
-Left out where a library is not installed, as pgeof, which nothing else needs. py4dgeo is beside `swath change --surface` in uses_change.py, GDAL beside `swath viewshed` in
-uses_sight.py; trees of neighbours are scipy's own.
+Left out where a library is not installed, as pgeof, which nothing else needs. py4dgeo is beside `swath change --surface` in
+uses_change.py, GDAL beside `swath viewshed` in uses_sight.py; trees of neighbours are scipy's own.
 
 registration_cpu_s, registration_corner_mm
                      of two clouds of hills with boxes, 100 x 100 m, 1 cm of noise, 0.3 m and 0.3 deg apart: time, worst corner
