@@ -150,6 +150,8 @@ def _points(cloud: reader.Cloud, week: int | None, progress: Progress) -> tuple[
         if some.any():
             times.append(clock.utc_ns(cloud.path, cloud.week_time, time_s[some]))
             places.append(chunk.points.xyz_m[some])
+        else:
+            clock.utc_ns(cloud.path, False, time_s)  # they have to be times at all
         progress(len(some))
     time_ns, xyz = np.concatenate(times), np.concatenate(places)
     order = np.argsort(time_ns, kind="stable")
