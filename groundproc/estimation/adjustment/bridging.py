@@ -75,19 +75,25 @@ def loose(track: Track) -> Mask:
     return np.asarray(misleading(track) | _silent(track))
 
 
-def along_untold_s(track: Track) -> float:
-    """Seconds of the longest stretch over which a single direction of the way is missing most of the time, as along plain walls.
+def along_untold(track: Track) -> Mask:
+    """Slices of the spans of ten seconds in which a single direction of the way is missing most of the time, as along plain walls.
 
     Here and there a slice seems to tell it: planes that lean by chance do.
     """
     single = unheld(track) & ~loose(track)
-    if not len(single):
-        return 0.0
     width = min(SHORTEST, len(single))
-    most = np.convolve(single, np.ones(width), mode="valid") > 0.5 * width
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], most, [False]])))
-    longest = int(np.diff(edges.reshape(-1, 2), axis=1).max(initial=0))
-    return (longest + width - 1) * SLICE_NS * 1e-9 if longest else 0.0
+    found = np.zeros(len(single), np.bool_)
+    if width:
+        most = np.convolve(single, np.ones(width), mode="valid") > 0.5 * width
+        for first in np.flatnonzero(most).tolist():
+            found[first : first + width] = True
+    return found
+
+
+def along_untold_s(track: Track) -> float:
+    """Seconds of the longest stretch of them."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], along_untold(track), [False]])))
+    return int(np.diff(edges.reshape(-1, 2), axis=1).max(initial=0)) * SLICE_NS * 1e-9
 
 
 def holds_somewhere(track: Track) -> bool:

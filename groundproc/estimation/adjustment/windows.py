@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from flightlog import frames
 from groundproc.estimation.adjustment.batch import DRAWS, Batch
+from groundproc.estimation.adjustment.bridging import along_untold
 from groundproc.estimation.adjustment.joining import Stiffness, stiffness_of
 from groundproc.estimation.adjustment.loops import closed_loops
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
@@ -186,6 +187,7 @@ def adjust_window(
     )  # fmt: skip
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart), retiming=retiming_of(observations, motion.source))
+    lidar.doubted = along_untold(track)[first:last]
     if motion.source == LIDAR:
         lidar.spin = spin_of(lidar.clusters, path)
         if lidar.spin is not None:

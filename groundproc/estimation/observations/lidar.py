@@ -49,12 +49,15 @@ class Lidar(Observation):
         The rotor and its line, where the lidar's own gyro carries the motion.
     retiming : Retiming or None
         How late the gyro is that carries the motion.
+    doubted : ndarray of bool, shape (intervals,), optional
+        Where one direction of the way is not told for long, as the odometry has it.
     """
 
     clusters: Clusters
     corrections: Array = field(default_factory=lambda: np.zeros(lasers.UNKNOWNS))
     spin: Spin | None = None
     retiming: Retiming | None = None
+    doubted: npt.NDArray[np.bool_] | None = None
     name: str = "lidar planes"
 
     def unknowns(self, unknowns: Unknowns) -> None:
@@ -72,7 +75,9 @@ class Lidar(Observation):
     def rows(self, path: Path, voxel_m: float, cut: bool) -> Rows:
         """Distances from planes, linear about a path; voxels have edges of `voxel_m`, outliers are `cut` or only weigh less."""
         turning = None if self.retiming is None else self.retiming.turning(path)
-        return rows_of(self.clusters, path, voxel_m, MOST, cut, MOST_FILLED, self.spin is not None, turning)
+        return rows_of(
+            self.clusters, path, voxel_m, MOST, cut, MOST_FILLED, self.spin is not None, turning, self.doubted
+        )
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
         """What is known of the line of the spin; all else is in `rows`."""

@@ -26,6 +26,7 @@ Array = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 Knots = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
 
 RANGE_SIGMA_M: Final = 0.02
 """Noise of a return (data sheet); what a voxel's own residuals show comes on top."""
@@ -120,6 +121,7 @@ class Rows(PlaneRows):
 
 def rows_of(
     clusters: Clusters, path: Path, voxel_m: float, most: int, cut: bool, filled: int = 0, spin: bool = False, turning: Array | None = None,
+    doubted: Mask | None = None,
 ) -> Rows:  # fmt: skip
     """Put clusters into voxels where the path places them, find the planes and what fills its voxel instead, and linearise.
 
@@ -138,6 +140,8 @@ def rows_of(
         Whether the line of the spin is an unknown.
     turning : ndarray, shape (grid, 3), optional
         What the path turns by for a second of its gyro's delay, where that is an unknown.
+    doubted : ndarray of bool, shape (intervals,), optional
+        As of `keep_told`.
     """
     world, rotation, knot, weights = _place_all(clusters, path)
     voxel, voxels = assign(world, voxel_m)
@@ -167,7 +171,7 @@ def rows_of(
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
     rotation, xyz = rotation[kept], clusters.xyz_m[kept]
     del world, knot, weights, voxel, order, good, keep, seen, poses, variance, leaves  # a hundred bytes a cluster
-    keep_told(rows, Poses(rotation, xyz), flat, voxel_m, means)
+    keep_told(rows, Poses(rotation, xyz), flat, voxel_m, means, doubted)
     if clusters.laser is not None:
         in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
         rows.with_lasers(clusters.laser[kept], xyz, in_sensor)

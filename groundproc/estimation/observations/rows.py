@@ -224,6 +224,9 @@ def whitened(
 
 
 PRIOR: Final = "prior"
+HOLD_M: Final = 100.0
+"""Of each coefficient of the path's position, one sigma: so weak that a bend which fixes alone know, over some hundred coefficients, is
+theirs to tell in one step; firm enough for what moves the whole to stay in the turn and the shift of the whole."""
 
 
 def prior_factor(unknowns: Unknowns) -> Factor:
@@ -231,7 +234,7 @@ def prior_factor(unknowns: Unknowns) -> Factor:
     size = unknowns.size
     sigma, residual = np.empty(size), np.zeros(size)
     coefficients = sigma[: unknowns.path_size].reshape(-1, 6)
-    coefficients[:, :3], coefficients[:, 3:] = np.deg2rad(10.0), 5.0
+    coefficients[:, :3], coefficients[:, 3:] = np.deg2rad(10.0), HOLD_M
     for name, place in unknowns.names.items():
         sigma[place] = unknowns.sigma[name]
         residual[place] = unknowns.value[name] - unknowns.expected[name]

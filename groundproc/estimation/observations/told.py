@@ -11,9 +11,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from groundproc.estimation.odometry.matching import FACING_VOXELS, GROUND, INFLATION, RELIEF, TELLS_M, observable
+from groundproc.estimation.odometry.tracker import SURE_HELD_M
 from groundproc.numerics.facing import mean_normals
 from groundproc.numerics.planeproducts import RowArrays
 from groundproc.numerics.planerows import PlaneRows
@@ -21,6 +22,7 @@ from groundproc.numerics.planerows import PlaneRows
 Array = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 Knots = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
 
 GROUND_SLICES: Final = 201
 """Slices whose ground makes one mean normal: were it each slice's own, its changes would seem to hold the place along the ground."""
@@ -28,6 +30,9 @@ SHAPE_SIGMA_RAD: Final = np.deg2rad(0.01)
 """What gyros of the lidar's class leave of the path's shape between two knots, 0.1 deg/sqrt(s) over a tenth of a second."""
 TOLD: Final = 5.5
 """Trace of a projection below which a direction is missing: it has one for each of the six that are there."""
+STEADY_SLICES: Final = 20.0
+"""Over so many slices, one sigma, the direction that is missing is one: by each slice for itself it would waver by a degree, and each
+change of it would seem to hold the way, for what slides along a wall must not go into it."""
 
 
 class Poses(NamedTuple):
@@ -44,7 +49,9 @@ class Poses(NamedTuple):
     xyz_m: Singles
 
 
-def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m: Array) -> None:
+def keep_told(
+    rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m: Array, doubted: Mask | None = None
+) -> None:  # fmt: skip
     """Leave in the rows of each interval what they really observe.
 
     This is judged on the axes of the map. On the axes of a body that tilts within the interval, the unobserved
@@ -63,6 +70,9 @@ def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m:
     voxel_m : float
     place_m : ndarray, shape (voxels, 3)
         Where each voxel is.
+    doubted : ndarray of bool, shape (intervals,), optional
+        Where, as the odometry has it, one direction of the way is not told for long. What seems to tell it there is believed only where it
+        does so firmly (`SURE_HELD_M`), and the direction is that of the seconds around.
     """
     normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
     _sum_ground(rows.knot[:flat], rows.jacobian, rows.weight, normals)
@@ -78,8 +88,10 @@ def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m:
     _face(rows.arrays, poses, flat, (normal, unsure), facing, judged)
     _blocks(rows.knot, facing, rows.weight, judged)
     size = np.trace(judged[:, 3:, 3:], axis1=1, axis2=2)
-    least = INFLATION * TELLS_M**-2 / np.maximum(size, 1e-12)
+    doubted = np.zeros(rows.intervals, np.bool_) if doubted is None else doubted
+    least = INFLATION * np.where(doubted, SURE_HELD_M, TELLS_M) ** -2 / np.maximum(size, 1e-12)
     known = np.array([observable(*each) if each[0].any() else np.eye(6) for each in zip(judged, least, strict=True)])
+    _steady(known, judged, doubted)
     affected = np.trace(known, axis1=1, axis2=2) < TOLD
     share = shares_of_relief(base, more)
     share[affected] = 0.0
@@ -90,6 +102,37 @@ def keep_told(rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m:
         weaker[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(base[blind, :3, :3])[:, 2])
         rows.weight *= weaker[rows.knot]
         rows.replane(voxel_m)
+
+
+def _steady(known: Array, judged: Array, doubted: Mask) -> None:
+    """Steady the projections `known` where it is doubted, by what the seconds around tell together.
+
+    A slice that tells a direction which those around it do not tell together is believed no more than they are.
+    """
+    if not doubted.any():
+        return
+    near = gaussian_filter1d(doubted.astype(np.float64), STEADY_SLICES, mode="constant")
+    around = np.where(doubted[:, None, None], judged, 0.0)
+    around = gaussian_filter1d(around, STEADY_SLICES, axis=0, mode="constant")
+    there = np.rint(np.trace(known, axis1=1, axis2=2))
+    for k in np.flatnonzero(doubted & (near > 0.0)).tolist():
+        mean = around[k] / near[k]
+        turn, shift = np.trace(mean[:3, :3]), np.trace(mean[3:, 3:])
+        if shift <= 0.0:
+            continue
+        # turns by what they move at the mean distance, as in `observable`
+        scale = np.repeat([np.sqrt(shift / max(turn, 1e-12)), 1.0], 3)
+        values, vectors = np.linalg.eigh(mean * scale * scale[:, None])
+        if there[k] == 6 and values[0] > INFLATION * SURE_HELD_M**-2:
+            continue
+        missing = vectors[:, 0]
+        # a shift along a wall turns nothing, and what noise adds of a turn would bend the path
+        values, vectors = np.linalg.eigh(mean[3:, 3:])
+        if values[0] <= INFLATION * SURE_HELD_M**-2:
+            missing = np.concatenate([np.zeros(3), vectors[:, 0]])
+        told = (np.eye(6) - np.outer(missing, missing)) * scale[:, None] / scale
+        # what misses more than this direction misses it too
+        known[k] = told if there[k] >= 5 else known[k] @ told
 
 
 def _facing(rows: PlaneRows, flat: int, place_m: Array, voxel_m: float) -> tuple[Array, Array]:
