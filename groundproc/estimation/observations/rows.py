@@ -227,6 +227,9 @@ PRIOR: Final = "prior"
 HOLD_M: Final = 100.0
 """Of each coefficient of the path's position, one sigma: so weak that a bend which fixes alone know, over some hundred coefficients, is
 theirs to tell in one step; firm enough for what moves the whole to stay in the turn and the shift of the whole."""
+ENDS: Final = 3
+END_M: Final = 5.0
+"""Of so many coefficients at each end: values at the knots leave a ripple open there, and where the lidar does too, nothing else ends it."""
 
 
 def prior_factor(unknowns: Unknowns) -> Factor:
@@ -235,6 +238,7 @@ def prior_factor(unknowns: Unknowns) -> Factor:
     sigma, residual = np.empty(size), np.zeros(size)
     coefficients = sigma[: unknowns.path_size].reshape(-1, 6)
     coefficients[:, :3], coefficients[:, 3:] = np.deg2rad(10.0), HOLD_M
+    coefficients[:ENDS, 3:] = coefficients[-ENDS:, 3:] = END_M
     for name, place in unknowns.names.items():
         sigma[place] = unknowns.sigma[name]
         residual[place] = unknowns.value[name] - unknowns.expected[name]
