@@ -229,7 +229,7 @@ HOLD_M: Final = 100.0
 theirs to tell in one step; firm enough for what moves the whole to stay in the turn and the shift of the whole."""
 ENDS: Final = 3
 END_M: Final = 5.0
-"""Of so many coefficients at each end: values at the knots leave a ripple open there, and where the lidar does too, nothing else ends it."""
+"""Of so many coefficients at each end: values at the knots leave a ripple open there, and where the lidar does too nothing else ends it."""
 
 
 def prior_factor(unknowns: Unknowns) -> Factor:

@@ -106,5 +106,6 @@ def test_several_right_sides_are_solved_as_each_by_itself(posed: tuple[Problem, 
         assert image == pytest.approx(problem.apply(right), rel=1e-9, abs=1e-9 * np.abs(image).max())
         alone, count = problem.solve(right, 0.0, 1e-3)
         steps.add(count)
-        assert each == pytest.approx(alone, rel=1e-9, abs=1e-9 * np.abs(alone).max())
+        # rounding, times what the problem is ill-conditioned by: the path's own coefficients are held with 100 m
+        assert each == pytest.approx(alone, rel=1e-8, abs=1e-8 * np.abs(alone).max())
     assert len(steps) > 1
