@@ -20,6 +20,7 @@ from groundproc.estimation.observations.planes import placed
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.laying import Flags, Laid, Target
 from groundproc.estimation.odometry.odometry import Odometry
+from groundproc.estimation.odometry.rejoining import ASTRAY_M
 from groundproc.estimation.odometry.relocation import FEWEST_ON, LEAST_SHARE, RADIUS_M, SURER, laid, surer
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.surfaces import FILLED, GROUND, STANDING, Surfaces, surfaces_of, thinned
@@ -129,7 +130,9 @@ class _Pieces:
             if seen is None:
                 continue
             mine, theirs = self.several(number - BESIDE, number), self.several(seen - BESIDE, seen + BESIDE)
-            as_it_is = _apart(mine, theirs, self.middle_m[number])
+            # plain walls agree however far along them the path is off: where the odometry knows that it may be, that is no proof
+            unsure = self._grown(seen, number)[:3].max() > ASTRAY_M
+            as_it_is = _apart(mine, theirs, self.middle_m[number], LEAST_SHARE if not unsure else np.inf)
             if as_it_is is None:
                 last = None
                 continue
@@ -150,21 +153,24 @@ class _Pieces:
         best = int(away.argmin())
         return best if away[best] < NEAR_M + self._drift(best, number)[:2].max() else None
 
+    def _grown(self, seen: int, number: int) -> Array:
+        """What of it the odometry states itself."""
+        return np.asarray(np.maximum(self._sigma[number], self._sigma[seen]))
+
     def _drift(self, seen: int, number: int) -> Array:
         """Sigma of east, north, up [m] and heading [rad] of one piece against another."""
-        grown = np.maximum(self._sigma[number], self._sigma[seen])
         own = DRIFT * (self._way_m[number] - self._way_m[seen])
         turned = DRIFT_RAD_S * (number - seen) * PIECE * SLICE_NS * 1e-9
-        return np.asarray(np.hypot(grown, np.array([own, own, own, turned])))
+        return np.asarray(np.hypot(self._grown(seen, number), np.array([own, own, own, turned])))
 
 
-def _apart(mine: Surfaces, theirs: Surfaces, about_m: Array) -> Flags | None:
-    """Which points of what stands lie on surfaces as it is; None where most do, or where too little is seen to say."""
+def _apart(mine: Surfaces, theirs: Surfaces, about_m: Array, enough: float) -> Flags | None:
+    """Which points of what stands lie on surfaces as it is; None where such a share of them does, or where too little is seen to say."""
     mine = thinned(mine.near(about_m, RADIUS_M))
     if min((mine.kind != GROUND).sum(), np.isin(theirs.kind, (STANDING, FILLED)).sum()) < FEWEST_ON:
         return None
     on, known = Target(theirs).agreement(mine)
-    return None if known.sum() < FEWEST_ON or on.sum() >= LEAST_SHARE * known.sum() else on
+    return None if known.sum() < FEWEST_ON or on.sum() >= enough * known.sum() else on
 
 
 def _is_better(found: Laid, as_it_is: Flags) -> bool:
