@@ -45,7 +45,8 @@ _CELLS: Final = (3.0, 10.0)
 _FEWEST: Final = 10.0
 """Points of ground on a patch, below which heights are not known well enough."""
 _LEAST_ON_PATCH: Final = 0.1
-"""As few are refused: cells of a raster over such a cloud are nearly all empty."""
+"""With fewer a wide cloud is refused: cells of a raster over it are nearly all empty."""
+_SMALL_M2: Final = 1e4
 _STANDING_M: Final = 3.0
 """What stands lower than this above the ground, and is none: walls, shrubs, cars, branches. Its foot passes for ground ..."""
 _BESIDE_M: Final = 0.5
@@ -200,7 +201,7 @@ def _ground(
         )
     wide = np.unique(((squares >> 35) << 32) + ((squares & 0xFFFFFFFF) >> 3))
     on_patch = float(counts.min()) / (64.0 * len(wide)) * task.size_m**2
-    if on_patch < _LEAST_ON_PATCH:
+    if on_patch < _LEAST_ON_PATCH and grid.columns * grid.rows * grid.cell_m**2 > _SMALL_M2:
         raise CoverageError(
             f"{task.cloud}: {on_patch:.2g} points of ground on a patch of {task.size_m:g} m, expected {_LEAST_ON_PATCH:g} or more; larger "
             "ones are found, see --size"
