@@ -53,7 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(sentence, file=sys.stderr)
 
     arguments.output.mkdir(parents=True, exist_ok=True)
-    quiet = not sys.stderr.isatty()
+    # rsync shows its progress on standard output: into a file it would be noise, and held to the limit for files
+    quiet = not (sys.stdout.isatty() and sys.stderr.isatty())
     outcome = pull(vehicle, arguments.output, say, anyway=arguments.anyway, quiet=quiet)
     for segment in outcome.brought:
         print(arguments.output / segment.name)

@@ -6,12 +6,13 @@ import os
 import resource
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from groundproc.field import bounded, pull
 
-GOOD = {"file": "00001-000.mcap", "size": 5, "sha256": hashlib.sha256(b"12345").hexdigest()}
+GOOD: dict[str, Any] = {"file": "00001-000.mcap", "size": 5, "sha256": hashlib.sha256(b"12345").hexdigest()}
 
 
 @pytest.fixture
@@ -98,6 +99,69 @@ def test_more_than_the_manifest_says_is_not_taken(answer: Path, tmp_path: Path) 
     assert trouble.startswith("00001-000.mcap: ")
     assert outcome.acknowledged == 0
     assert sum(path.stat().st_size for path in here.rglob("*") if path.is_file()) <= 6
+
+
+def test_no_more_than_a_byte_beyond_the_manifest_ever_lies_on_the_disk(
+    answer: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest(answer, json.dumps(GOOD).encode())
+    (answer / "00001-000.mcap").write_bytes(b"x" * 50_000_000)
+    here = tmp_path / "here"
+    here.mkdir()
+    run, lay = bounded.run, []
+
+    def watched(*words: Any, **limits: Any) -> bounded.Done:
+        done = run(*words, **limits)
+        lay.append(sum(path.stat().st_size for path in here.rglob("*") if path.is_file()))
+        return done
+
+    monkeypatch.setattr(bounded, "run", watched)
+    pull.pull(pull.Vehicle("a@b"), here, lambda _: None)
+    assert max(lay) <= GOOD["size"] + 1
+
+
+def test_a_line_may_have_so_many_letters_and_no_more(answer: Path, tmp_path: Path) -> None:
+    line = json.dumps(GOOD).encode()
+    manifest(answer, line + b" " * ((1 << 16) - len(line)))
+    (answer / "00001-000.mcap").write_bytes(b"12345")
+    assert pull.segments(pull.Vehicle("a@b"))[0].size == 5
+    manifest(answer, line + b" " * ((1 << 16) + 1 - len(line)))
+    assert "line 1 of its manifest is none" in sentence(tmp_path)
+
+
+@pytest.mark.parametrize("left", [b"12", b"1x"])
+def test_what_happens_is_said(answer: Path, tmp_path: Path, left: bytes) -> None:
+    """What an earlier pull left is gone on with; where that was spoilt, so that the sum is wrong, it is said too."""
+    data = left[:1] * 1_000_000 + b"2" * 1_500_000
+    good = GOOD | {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    manifest(answer, json.dumps(good).encode())
+    (answer / "00001-000.mcap").write_bytes(data)
+    part = tmp_path / "here" / pull.INCOMING / "00001-000.mcap"
+    part.parent.mkdir(parents=True)
+    spoilt = left == b"1x"
+    part.write_bytes(left[1:] + data[1:] if spoilt else data[:1_000_000])
+    if spoilt:
+        stamp = (answer / "00001-000.mcap").stat().st_mtime
+        os.utime(part, (stamp, stamp))  # of the same size and time it is whole to rsync
+    said: list[str] = []
+    outcome = pull.pull(pull.Vehicle("a@b"), tmp_path / "here", said.append)
+    assert outcome.troubles == []
+    assert (tmp_path / "here" / "00001-000.mcap").read_bytes() == data
+    assert said[0] == f"00001-000.mcap: goes on at {2.5 if spoilt else 1.0} of 2.5 MB"
+    assert said[1:] == ["00001-000.mcap: the sum is wrong; what differs is brought again"] * spoilt
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_progress_is_shown_where_it_is_wanted(
+    answer: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], quiet: bool
+) -> None:
+    data = bytes(100_000)
+    manifest(answer, json.dumps(GOOD | {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}).encode())
+    (answer / "00001-000.mcap").write_bytes(data)
+    here = tmp_path / "here"
+    here.mkdir()
+    pull.pull(pull.Vehicle("a@b"), here, lambda _: None, quiet=quiet)
+    assert ("100%" in capfd.readouterr().out) is not quiet
 
 
 def test_space_is_asked_for_before_anything_comes(answer: Path, tmp_path: Path) -> None:
