@@ -128,7 +128,8 @@ def fitted(xyz_m: Array) -> Catenary:
         low = float(found.x[2]) - 2.0 * a * np.sinh((origin_s - middle) / (2.0 * a)) ** 2
     wire = Catenary(origin, along, float(s.min()), float(s.max()), float(a), float(middle), float(low), 0.0, len(xyz_m))
     _, _, up = wire.local(xyz_m)
-    rms = float(np.sqrt(np.median(off**2 + up**2) / 0.45))
+    # the median of a squared distance in a plane is ln 2 of its mean; a few points of something else do not count
+    rms = float(np.sqrt(np.median(off**2 + up**2) / np.log(2.0)))
     return Catenary(origin, along, wire.start_m, wire.end_m, wire.a_m, wire.middle_m, wire.low_m, rms, len(xyz_m))
 
 

@@ -16,7 +16,7 @@ FEWEST: Final = 10
 SHORTEST_M: Final = 10.0
 _LEAST_PIECE: Final = 6
 _LEAST_PIECE_M: Final = 5.0
-_ROUGH_M: Final = 0.08
+_ROUGH_M: Final = 0.064
 """A chain that deviates by more from one curve may be of two spans ..."""
 _BETTER: Final = 3.0
 """... and is, if two curves leave so much less of its squares."""
@@ -38,7 +38,7 @@ _NEXT_M: Final = 0.5
 """A curve takes points so far beyond its ends: further on it meets others of its bundle."""
 _SAME_M: Final = 0.1
 """Curves nearer to each other are one."""
-_WORST_M: Final = 0.15
+_WORST_M: Final = 0.12
 _JOIN_M: Final = 40.0
 """Gap that a conductor may have."""
 _COVERED: Final = 0.5
@@ -193,7 +193,7 @@ def _together(points: Array, curve: Catenary, others: Array, other: Catenary) ->
     if np.median(np.abs(off)) > 0.4 + 0.01 * gap or np.median(np.abs(up)) > 0.6 + 0.04 * max(gap, 0.0):
         return None
     both = fitted(np.concatenate([points, others]))
-    return both if both.rms_m < 1.3 * max(curve.rms_m, other.rms_m, 0.04) else None
+    return both if both.rms_m < 1.3 * max(curve.rms_m, other.rms_m, 0.032) else None
 
 
 def settled(pieces: Sequence[Array]) -> list[Array]:

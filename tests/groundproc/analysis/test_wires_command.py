@@ -142,6 +142,16 @@ def test_a_catenary_is_found_again_from_its_own_places(a_m: float) -> None:
     assert wire.rms_m < 1e-3
 
 
+def test_scatter_about_a_wire_is_the_true_one() -> None:
+    """2 cm across and in height are 2.8 cm in all, whatever one point of thirty hangs on."""
+    rng = np.random.default_rng(0)
+    s = rng.uniform(-31.0, 44.0, 3000)
+    places = np.column_stack([s, np.zeros_like(s), 7.0 + 300.0 * (np.cosh((s - 5.0) / 300.0) - 1.0)])
+    places[:, 1:] += rng.normal(0.0, 0.02, (len(s), 2))
+    places[::30, 2] += 0.3
+    assert fitted(places).rms_m == pytest.approx(0.02 * np.sqrt(2.0), rel=0.06)
+
+
 def test_distances_to_a_wire_are_those_of_brute_force() -> None:
     s = np.linspace(0.0, 50.0, 40)
     wire = fitted(np.column_stack([s, np.zeros_like(s), 10 + (s - 20) ** 2 / 400]))
