@@ -61,7 +61,12 @@ DATAFLASH: Final = Kind(
 MAVLINK: Final = Kind(
     "mavlink", "a MAVLink stream without times", "nothing ties it to a lidar; a .tlog or a .bin is needed"
 )
-CLOUD: Final = Kind("cloud", "a point cloud (LAS or LAZ)", "`swath adjust {} -t TRAJECTORY -o DIR` adjusts its strips")
+CLOUD: Final = Kind(
+    "cloud",
+    "a point cloud (LAS or LAZ)",
+    "`swath view {0}` shows it, `swath ground {0} -o OUT.laz --dtm DTM.tif` makes a terrain model of it, "
+    "`swath adjust {0} -t TRAJECTORY -o DIR` adjusts its strips",
+)
 SOLUTION: Final = Kind(
     "solution", "a GNSS solution or trajectory", "`swath process LOG --positions {} -o DIR` takes it along"
 )

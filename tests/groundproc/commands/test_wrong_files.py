@@ -26,7 +26,7 @@ FILES: dict[str, tuple[bytes, str, str]] = {
     "a.pcapng": (b"\x0a\x0d\x0d\x0a" + bytes(20), "a packet capture", "swath import --pcap"),
     "a.tlog": (_tlog(), "a telemetry log", "--mavlink"),
     "a.bin": (b"\xa3\x95\x80\x80" + bytes(85), "a dataflash log", "--mavlink"),
-    "a.las": (b"LASF" + bytes(371), "a point cloud", "swath adjust"),
+    "a.las": (b"LASF" + bytes(371), "a point cloud", "swath ground"),
     "a.bag": (b"#ROSBAG V2.0\n", "a ROS bag", "swath import --bag"),
     "a.obs": (RINEX, "raw GNSS observations", "swath ppk"),
     "a.pos": (POS, "a GNSS solution", "--positions"),
