@@ -5,7 +5,7 @@ of a uniform disc. What they meet within 0.6 m of each other makes one echo in b
 appendix B: two surfaces are told apart from 0.6 m, a pulse of 4 ns); more makes several.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numba as nb
 import numpy as np
@@ -151,7 +151,7 @@ def form(
     met = np.empty((2 * rays, 2))
     who = np.empty((2 * rays, 2), np.int32)
     for shot in range(shots):
-        count = np.int64(0)  # of a constant's own type, what takes it would be compiled twice
+        count: Any = np.int64(0)  # of a constant's own type, what takes it would be compiled twice
         for ray in range(shot * rays, (shot + 1) * rays):
             light = 1.0 / rays
             hit_m, cosine = -1.0, 0.0

@@ -189,7 +189,7 @@ def backward_rows(m: Array, dt: float, couple: Array, keep: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def congruent(p: Array, dt: float, couple: Array, keep: Array, back: bool) -> None:
+def congruent(p: Array, dt: float, couple: Array, keep: Array, back: "bool | np.bool_") -> None:
     """Make of symmetric p, in place: transition @ p @ transition.T, or the same with the transposed transition.
 
     Kernels give `back` as `np.bool_`: of a constant's own type, this would be compiled twice.

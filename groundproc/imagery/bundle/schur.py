@@ -4,7 +4,7 @@ Points are worked one by one. A point's columns are those of the stations and ca
 matrix. A point that its rows leave undetermined adds nothing.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -95,7 +95,7 @@ def _known_of_point(
             normal[k] = weight * system.row_normal[i, k]
             left += normal[k] * point[k]
             arm[k] = point[k] - system.centre_m[k]
-        used = np.int64(0)
+        used: Any = np.int64(0)
         if system.row_moves[i] and weight > 0.0:
             # the plane is shifted and turned with all of the cloud
             used = _POSE
@@ -123,7 +123,7 @@ def _point_system(
     for j in range(3):
         for k in range(4):
             own[j, k] = 0.0
-    count = np.int64(0)  # of a constant's own type, what takes it would be compiled twice
+    count: Any = np.int64(0)  # of a constant's own type, what takes it would be compiled twice
     residual = np.zeros(2)
     by_pose, by_point, by_camera = np.zeros((2, _POSE)), np.zeros((2, 3)), np.zeros((2, _OF_CAMERA))
     place = np.empty(_POSE + _OF_CAMERA, np.int64)
@@ -133,7 +133,7 @@ def _point_system(
             continue
         image = system.image[i]
         station, camera = system.station[image], system.camera[image]
-        used = np.int64(0)
+        used: Any = np.int64(0)
         for j in range(_POSE + _OF_CAMERA):
             column = system.station_column[station, j] if j < _POSE else system.camera_column[camera, j - _POSE]
             if column < 0:
