@@ -10,6 +10,7 @@ import os
 import platform
 import subprocess
 import sys
+import textwrap
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -35,8 +36,10 @@ NOTES: Final = {
 HEAD: Final = """\
 # Benchmarks
 
-Written by `make bench` from docs/benchmarks.json. The peers of a benchmark are measured in turn with ours in the same run:
-ratios carry over to other machines, absolute figures do not."""
+Written by `make bench` from docs/benchmarks.json. The peers of a benchmark are measured in turn with ours in the same
+run: ratios carry over to other machines, absolute figures do not."""
+WIDTH: Final = 118
+"""Of the page's lines, but for tables."""
 
 
 def run(name: str) -> dict[str, Any]:
@@ -100,6 +103,11 @@ def show(value: Any) -> str:
     return json.dumps(value) if isinstance(value, (dict, list)) else "-" if value is None else str(value)
 
 
+def wrapped(text: str, indent: str = "") -> str:
+    """A paragraph in lines; words with a hyphen stay whole."""
+    return textwrap.fill(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)
+
+
 def page(sections: dict[str, Any]) -> str:
     """The whole page."""
     parts = [HEAD]
@@ -107,8 +115,8 @@ def page(sections: dict[str, Any]) -> str:
         parts += [f"## {name}", f"`make bench-{name}`"]
         parts += [NOTES[name]] if name in NOTES else []
         parts += ["It failed." if section["figures"] is None else table(section["figures"])]
-        parts += ["\n".join(f"- {each}." for each in section["notes"])] if "notes" in section else []
-        parts += [f"On {section['machine']}; {section['versions']}."]
+        parts += ["\n".join(wrapped(f"- {each}.", "  ") for each in section["notes"])] if "notes" in section else []
+        parts += [wrapped(f"On {section['machine']}; {section['versions']}.")]
     return "\n\n".join(parts) + "\n"
 
 
