@@ -19,8 +19,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/pytest
-# A file of tests stays on one worker, so that what its fixtures made is made once; tests/conftest.py has the longest begin,
-# and says how many workers there are.
+# A file of tests stays on one worker, so that what its fixtures made is made once; tests/conftest.py has the longest begin.
 PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup demo static test check soak bench docs deb release clean
@@ -54,14 +53,13 @@ $(VENV)/.python: $(VENV)/.apt
 	done; echo "no Python of 3.11 or newer with venv was found" >&2; exit 1
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
-	@# --no-compile: of 17,000 modules, a minute and more of one core, a run imports a part, and compiles that by itself
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
 # A test lets MAVProxy show our messages; what it would bring along (vtk, opencv) is not needed for that. It has to be built, and
 # so comes beside the kernels.
 $(VENV)/.mavproxy: $(VENV)/.installed
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps MAVProxy==1.8.75 || echo "warning: no MAVProxy" >&2
 	@touch $@
 
 $(VENV)/.warm: $(VENV)/.installed

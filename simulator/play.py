@@ -29,7 +29,12 @@ _PCAP_HEAD: Final = 24
 _FRAME_HEAD: Final = 42
 _SLICE_S: Final = 0.002
 """Events due within this time are sent together; a timer is not finer than this on a busy machine."""
-_PATIENCE_S: Final = 0.5
+_PATIENCE_S: Final = 5.0
+"""For a reader of the terminal that takes nothing: a busy machine may not let it run for a second or two."""
+_ABSENT_S: Final = 0.5
+"""For one that let the terminal fill up before."""
+_LOOKS: Final = 10
+"""So many times in turn the terminal has to be empty: what was written reaches it a moment later."""
 
 
 class Target(NamedTuple):
@@ -152,17 +157,18 @@ def play(
                 _send(sock, event.payload, (address, ports.get(event.port, target.position_port)), played)
             else:
                 _write(master, event.payload, played)
-        _drain(slave)
+        _drain(slave, _ABSENT_S if played.unread_bytes else _PATIENCE_S)
         return played
 
 
-def _drain(slave: int) -> None:
+def _drain(slave: int, patience_s: float) -> None:
     """Wait for the reader: what is unread when the terminal closes is lost. Not for one who has stopped reading."""
-    left, patience_s = _unread(slave), _PATIENCE_S
-    while left and patience_s > 0:
+    left, waited_s, empty = _unread(slave), 0.0, 0
+    while empty < _LOOKS and waited_s < patience_s:
         time.sleep(_SLICE_S)
         now = _unread(slave)
-        patience_s = _PATIENCE_S if now < left else patience_s - _SLICE_S
+        empty = 0 if now else empty + 1
+        waited_s = 0.0 if now < left else waited_s + _SLICE_S
         left = now
 
 

@@ -53,12 +53,6 @@ LONGEST = (
 """Files that take half a minute and more, the longest first; files of one flight apart, or the second waits for the first to make it."""
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """One worker more than there are cores: a seventh of the tests' time they wait, for packets, servers, clocks of a flight."""
-    return (os.cpu_count() or 1) + 1
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files begin: one that came last would keep one worker while the other is idle."""
     rank = {Path(__file__).parent / name: number for number, name in enumerate(LONGEST)}
