@@ -1,5 +1,7 @@
 """A path that drifts by metres without being lost comes back: it is laid on what it saw before, and on nothing else."""
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,6 +15,7 @@ from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
 
 Array = npt.NDArray[np.float64]
+Route = Callable[[Array], tuple[Array, Array]]
 START_NS = 1_779_000_000_000_000_000
 SEEN = 120
 """Clusters of a slice."""
@@ -66,13 +69,11 @@ def there_and_back(seconds: Array) -> tuple[Array, Array]:
     return np.stack([out, 0.0 * out, 2.0 + 0.0 * out], axis=1), 0.0 * seconds
 
 
-def flown(
-    walls: list[tuple[Array, Array, float]], route: object, slices: int, drift: float
-) -> tuple[Path, Track, Path]:
+def flown(walls: list[tuple[Array, Array, float]], route: Route, slices: int, drift: float) -> tuple[Path, Track, Path]:
     """A drifting path, its track, and the true path; what is seen are points of walls and ground within 35 m."""
     rng = np.random.default_rng(7)
     seconds = np.arange(slices * STEPS + 1) * STEP_NS * 1e-9
-    place, heading = route(seconds)  # type: ignore[operator]
+    place, heading = route(seconds)
     true = Path(START_NS, frames.quat_exp(np.stack([0 * heading, 0 * heading, heading], axis=1)), place)
     begins, ends, heights = (np.array([each[i] for each in walls]) for i in range(3))
     length = np.linalg.norm(ends - begins, axis=1)
