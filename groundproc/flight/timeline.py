@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.clock import utc_text
+from flightlog.constants import NS_PER_MS
 from flightlog.errors import ClockError
 from flightlog.nmea import Rmc
 from groundproc.flight.autopilot import Boot
@@ -45,6 +46,12 @@ class LidarRun:
     gyro: GyroTrack | None
     fixes: tuple[tuple[int, Rmc], ...]
     force_m_s2: Array | None = None
+
+    def less_delay(self, delay_ms: float) -> "LidarRun":
+        """The same with readings of gyro and accelerometers stamped so much earlier: they are late against the returns."""
+        if self.gyro is None or delay_ms == 0.0:
+            return self
+        return replace(self, gyro=replace(self.gyro, time_ns=self.gyro.time_ns - round(delay_ms * NS_PER_MS)))
 
 
 @dataclass(frozen=True, slots=True)

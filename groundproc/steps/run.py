@@ -4,6 +4,7 @@ import contextlib
 import functools
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -90,7 +91,9 @@ class Run:
     @cached_property
     def flight(self) -> Flight:
         """Autopilot, gyros and clocks of the flight."""
-        return read_flight(self.readers, "ins", functools.partial(self.progress, "read"))
+        flight = read_flight(self.readers, "ins", functools.partial(self.progress, "read"))
+        late_ms = self.survey.gyro_delay_ms
+        return replace(flight, runs=[each.less_delay(late_ms) for each in flight.runs])
 
     @cached_property
     def timeline(self) -> Sequence[Leg]:

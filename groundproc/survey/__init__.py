@@ -43,6 +43,15 @@ class ClockSettings:
         words=("--sync",),
         choices=("auto", "gyro", "host"),
     )
+    gyro_delay_ms: float = setting(
+        0.0,
+        "how late the readings of the lidar's gyro are against its returns, as an earlier flight of the same unit found it: lidar.delay_s "
+        "in its quality.json [ms]",
+        words=("--gyro-delay-ms",),
+        metavar="MS",
+        minimum=-50,
+        maximum=50,
+    )
 
 
 @dataclass(frozen=True)

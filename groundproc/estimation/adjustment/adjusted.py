@@ -200,7 +200,8 @@ def adjust_run(
     units = {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None}
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     observations = [*observations_of(Flown(given, legs, units)), *more]
-    sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE)
+    known = {"lidar.delay": given.survey.gyro_delay_ms * 1e-3}
+    sources = Sources(observations, mat, lever, exact, given.survey.lasers == ESTIMATE, known)
     attitudes = next((found for leg in legs if (found := attitude_track(leg)) is not None), None)
     stated = Recorded(position_track(given, legs[0]), attitudes)
     tracker = Tracker(

@@ -228,7 +228,7 @@ class Run:
             scale = float(np.rad2deg(1.0)) if unit.startswith("deg") else 1.0
             prior = known.sigma[name]
             values[f"{name}_{unit}" if unit else name] = {
-                "value": (value * scale).tolist(),
+                "value": ((value + self.sources.known.get(name, 0.0)) * scale).tolist(),
                 "sigma": (sigma * scale).tolist(),
                 "prior_sigma": (prior * scale).tolist(),
                 "held": (sigma > 0.7 * prior).tolist(),

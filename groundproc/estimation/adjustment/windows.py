@@ -67,6 +67,8 @@ class Sources:
         Globals whose covariance is wanted exactly.
     lasers_apart : bool
         Whether clusters are of one laser each, and the corrections of lasers unknowns.
+    known : mapping of str to float
+        What of a global has been taken off the readings already: reports state the whole.
     """
 
     observations: Sequence[Observation]
@@ -74,6 +76,7 @@ class Sources:
     lever_m: Array
     exact: tuple[str, ...] = ()
     lasers_apart: bool = False
+    known: Mapping[str, float] = field(default_factory=dict)
 
     def leads(self) -> bool:
         """Whether something is better, where the lidar sees nothing, than what the adjustment began from."""

@@ -15,6 +15,7 @@ from groundproc.survey.setting import command_of
 
 TYPED = {
     "mount": (["--mount", "m.yaml"], "m.yaml"), "sync": (["--sync", "host"], "host"),
+    "gyro_delay_ms": (["--gyro-delay-ms", "4.2"], 4.2),
     "method": (["--method", "ins"], "ins"), "causal": (["--causal"], True), "positions": (["--positions", "a.pos"], "a.pos"),
     "poses": (["--poses", "t.csv"], "t.csv"),
     "control": (["--control", "c.csv"], "c.csv"), "lasers": (["--lasers", "estimate"], "estimate"),

@@ -55,6 +55,20 @@ def test_without_gps_on_the_lidar_system_time_tells_utc_and_the_gyros_the_rest(p
     assert abs(np.median(off_ns) - np.median(boot_off_ns)) < 4 * leg.sync.sigma_offset_ns
 
 
+def test_a_known_delay_of_the_lidars_gyro_is_taken_off_its_stamps_and_so_off_the_tie(plain_flight: Any) -> None:
+    """Readings of 4 ms ago, believed prompt, would put the autopilot 4 ms too late on the lidar's clock."""
+    flight = flight_of(plain_flight.log)
+    (prompt,) = legs(flight.runs, flight.boots, MAT, "gyro")
+    runs = [run.less_delay(4.0) for run in flight.runs]
+    (late,) = legs(runs, flight.boots, MAT, "gyro")
+    assert (runs[0].gyro.time_ns == flight.runs[0].gyro.time_ns - 4 * MS).all()
+    assert flight.runs[0].less_delay(0.0) is flight.runs[0]
+    lidar_ns = flight.runs[0].gyro.time_ns
+    moved_ns = late.sync.ins_time_ns(lidar_ns) - prompt.sync.ins_time_ns(lidar_ns)
+    # the grid of the search lies elsewhere on the same curve
+    assert np.abs(moved_ns - 4 * MS).max() < 0.2 * prompt.sync.sigma_offset_ns
+
+
 def test_a_lidar_with_gps_tells_utc_itself(gps_flight: Any) -> None:
     flight = flight_of(gps_flight.log)
     (leg,) = legs(flight.runs, flight.boots, MAT, "auto")
