@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from flightlog.errors import CoverageError
 from groundproc.analysis.registrationstep import PRIOR, Surface, settled, step_towards
 from groundproc.numerics.normals import EDGES_M, FEWEST, normals
-from groundproc.numerics.voxelhash import assign
+from groundproc.numerics.voxelhash import assign, row_by_row
 
 Array = npt.NDArray[np.float64]
 
@@ -29,7 +29,9 @@ _PLANES: Final = 150_000
 _SAMPLE: Final = 60_000
 """Points of B that are laid on A, and fewer from afar."""
 _FAR_SAMPLE: Final = 10_000
-_FAR_M: Final = 0.5
+_CELL_M: Final = 1.0
+"""Points are sorted by cells of the ground: searches among neighbours find what they need in the cache."""
+_FAR_M: Final = 0.3
 _STAGES_M: Final = (3.0, 1.5, 0.8, 0.8, 0.4, 0.4, 0.25, 0.25, 0.25)
 _CONSENSUS: Final = (3, 4)
 """Stages that ask what most groups agree in: where a block moved as one, a fit of all lies between it and the rest, and stays there."""
@@ -108,7 +110,7 @@ def register(a_m: Array, b_m: Array, what: str = "the two clouds") -> Registrati
         They have no place in common, or do not fit.
     """
     about = np.round(a_m.mean(axis=0))
-    a, b = a_m - about, b_m - about
+    a, b = (each.take(row_by_row(each, _CELL_M), axis=0) - about for each in (a_m, b_m))
     surface, sample = _smoothed(a, what, _PLANES), _smoothed(b, what, _SAMPLE)
     tree: Any = cKDTree(surface.xyz, balanced_tree=False)
     few = max(1, len(sample.xyz) // _FAR_SAMPLE)

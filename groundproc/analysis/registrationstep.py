@@ -131,8 +131,10 @@ def settled(surface: Surface, other: Surface, moved: Array, matrix: Array) -> tu
 
 def _medians(values: Array, group: npt.NDArray[np.int64]) -> Array:
     """The median of each group."""
-    parts = np.split(values[np.argsort(group, kind="stable")], np.cumsum(np.bincount(group))[:-1])
-    return np.array([np.median(each) for each in parts])
+    ordered = values[np.lexsort((values, group))]
+    count = np.bincount(group)
+    first = np.cumsum(count) - count
+    return np.asarray(0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2]))
 
 
 def _groups(moved: Array) -> npt.NDArray[np.int64]:

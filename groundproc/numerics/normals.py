@@ -13,7 +13,7 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.numerics.planes import flattest
-from groundproc.numerics.voxelhash import around, numbered, table_for
+from groundproc.numerics.voxelhash import around, numbered, row_by_row, table_for
 
 Array = npt.NDArray[np.float64]
 
@@ -21,6 +21,8 @@ EDGES_M: Final = (0.15, 0.3, 0.6, 1.2, 2.4)
 """Edges of voxels; a plane is fitted to 3 x 3 x 3 of them."""
 HALO_M: Final = 4.0 * EDGES_M[-1]
 """How far from a point others may decide on its normal."""
+_CELL_M: Final = 1.0
+"""Of the ground; points are sorted by it, so that neighbours lie near each other in memory."""
 FEWEST: Final = 12
 """Points of a plane."""
 _ON: Final = 3.0
@@ -82,17 +84,32 @@ def normals(
     Normals
         Of m points.
     """
-    local = np.ascontiguousarray(xyz_m - np.floor(xyz_m.min(axis=0))) if len(xyz_m) else np.empty((0, 3))
-    levels = [_level(local, edge) for edge in edges_m] if len(local) else []
-    levels = [level._replace(voxel=np.ascontiguousarray(level.voxel[of])) for level in levels]
-    asked = np.ascontiguousarray(local[of])
+    if not len(xyz_m):
+        return Normals(np.empty((0, 3)), *(np.empty(0) for _ in range(3)))
+    order = row_by_row(xyz_m, _CELL_M)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    place = place[of]
+    back = np.argsort(place)
+    rows = place[back]
+    local = xyz_m.take(order, axis=0)
+    local -= np.floor(local.min(axis=0))
+    levels = [_level(local, edge) for edge in edges_m]
+    levels = [level._replace(voxel=level.voxel[rows]) for level in levels]
+    asked = local[rows]
     found = Normals(np.full((len(asked), 3), np.nan), *(np.full(len(asked), np.nan) for _ in range(3)))
     limit = np.full(len(asked), np.inf)
     for level in levels:
         _limits(asked, level, limit)
     for level in levels:
         _choose(asked, level, limit, found)
-    return found
+    return Normals(*(_put_back(each, back) for each in found))
+
+
+def _put_back(values: Array, back: npt.NDArray[np.int64]) -> Array:
+    out = np.empty_like(values)
+    out[back] = values
+    return out
 
 
 def _level(xyz_m: Array, edge_m: float) -> _Level:
