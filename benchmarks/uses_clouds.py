@@ -117,7 +117,7 @@ def detection(folder: Path) -> dict[str, Any]:
         las = laspy.read(source)
         floor = Floor(reader.look(source), folder, lambda done: None)
         xyz = np.ascontiguousarray(las.xyz)
-        moved, boxes = outdoors.with_vehicles(xyz, xyz[:, 2] - bilinear(floor.base.values, floor.grid, xyz), 1, 40)
+        moved, boxes = outdoors.with_vehicles(xyz, xyz[:, 2] - floor.base.bilinear(xyz), 1, 40)
         las.z = moved[:, 2]
         las.write(folder / "c.laz")
         run("detect", folder / "c.laz", "-o", folder / "o.geojson", "--min-score", "-20")

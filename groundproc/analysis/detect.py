@@ -25,7 +25,6 @@ from groundproc.cloud.rewriter import Rewriter
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
 from groundproc.raster.grid import Grid, Window
-from groundproc.raster.sampling import bilinear
 from groundproc.vectors.features import Features, write_features
 
 Array = npt.NDArray[np.float64]
@@ -126,7 +125,7 @@ def work(task: Task, progress: Progress) -> Made:
 
 def _above(floor: Floor, xyz: Array) -> npt.NDArray[np.float32]:
     """Heights above the smoothed ground: of one cell to the next it does not jump, and flat tops stay flat."""
-    return (xyz[:, 2] - bilinear(floor.base.values, floor.grid, xyz)).astype(np.float32)
+    return (xyz[:, 2] - floor.base.bilinear(xyz)).astype(np.float32)
 
 
 def _counted(task: Task, floor: Floor) -> Layers:

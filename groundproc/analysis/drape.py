@@ -25,7 +25,6 @@ from groundproc.cloud.tiles import Found, Tiles, side_for
 from groundproc.files import written_aside
 from groundproc.raster.bands import Bands, opened_bands
 from groundproc.raster.cells import Cells
-from groundproc.raster.grid import Window
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
@@ -192,12 +191,7 @@ def _across(task: Task, cloud: reader.Cloud, bands: Bands) -> Callable[[Array], 
 
 def _uppermost(xyz: Array, tops: Cells, top_m: float) -> npt.NDArray[np.bool_]:
     """Points near the top of their cell, shape (n,)."""
-    cell = np.floor(xyz[:, :2] / _CELL_M).astype(np.int64)
-    left, bottom = cell.min(axis=0)
-    right, top = cell.max(axis=0)
-    window = Window(int(left), int(bottom), int(right - left) + 1, int(top - bottom) + 1)
-    highest = tops.window(window, "max")
-    return np.asarray(xyz[:, 2] > highest[top - cell[:, 1], cell[:, 0] - left] - top_m)
+    return np.asarray(xyz[:, 2] > tops.at(xyz, "max") - top_m)
 
 
 def _as(name: str, values: npt.NDArray[np.float32]) -> npt.NDArray[Any]:

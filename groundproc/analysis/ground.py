@@ -16,7 +16,7 @@ import numpy.typing as npt
 import shapely
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from groundproc.analysis.terrain.building import outlines, roofs
+from groundproc.analysis.terrain.building import roof_outlines, roofs
 from groundproc.analysis.terrain.floor import FILL_M, Floor
 from groundproc.analysis.terrain.holdout import HoldOut
 from groundproc.analysis.terrain.settings import Settings, settings_for
@@ -45,7 +45,6 @@ from groundproc.raster.cells import Cells
 from groundproc.raster.fill import fill
 from groundproc.raster.grid import Grid, Window
 from groundproc.raster.openings import dilated, eroded
-from groundproc.raster.sampling import bilinear
 from groundproc.vectors.features import Features, write_features
 
 Array = npt.NDArray[np.float64]
@@ -139,10 +138,10 @@ class _Area:
             bare = kind == GROUND
             if grass_m is None:
                 grass_m = _scatter(above[bare]) if bare.any() else None
-            slack = bilinear(self.floor.reach.values, self.grid, xyz) - self.settings.height_m
+            slack = self.floor.reach.bilinear(xyz) - self.settings.height_m
             bare &= above < (grass_m or 0.0) + slack * _GRASS_SHARE
             # above a surface so smooth that its mean within a cell is its value in the middle: slopes do no harm
-            ground.add(xyz[bare], xyz[bare, 2] - bilinear(self.floor.base.values, self.grid, xyz[bare]))
+            ground.add(xyz[bare], xyz[bare, 2] - self.floor.base.bilinear(xyz[bare]))
             seen = (kind != LOW_NOISE) & (kind != HIGH_NOISE)
             top.add(xyz[seen], xyz[seen, 2])
         self._model(ground, top)
@@ -160,6 +159,8 @@ class _Area:
         )
         halo = round(FILL_M / cell_m)
         for number, (block, around, cut) in enumerate(blocks(self.grid, halo)):
+            if not self.floor.base.holds(block):
+                continue
             base = self.floor.base.window(around)
             if not np.isfinite(cut(base)).any():
                 continue
@@ -203,7 +204,7 @@ class _Area:
     def classes(self, xyz: Array, noise: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
         """Height above the terrain, and class."""
         _, kind = self.floor.heights(xyz, noise)
-        hag = (xyz[:, 2] - bilinear(self.terrain.values, self.grid, xyz)).astype(np.float32)
+        hag = (xyz[:, 2] - self.terrain.bilinear(xyz)).astype(np.float32)
         other = kind == UNCLASSIFIED
         grid = self.grid
         column = np.floor((xyz[:, 0] - grid.west_m) / grid.cell_m).astype(np.int64).clip(0, grid.columns - 1)
@@ -211,7 +212,7 @@ class _Area:
         kind[other & (hag <= _LOW_M)] = LOW
         kind[other & (hag > _LOW_M) & (hag <= _MEDIUM_M)] = MEDIUM
         kind[other & (hag > _MEDIUM_M)] = HIGH
-        kind[other & (hag > 1.0) & (self.roof.values[down, column] > 0)] = BUILDING
+        kind[other & (hag > 1.0) & (self.roof.at(down, column) > 0)] = BUILDING
         if self.water is not None:
             kind[(np.abs(hag) < _LOW_M) & ((kind == GROUND) | (kind == LOW)) & self.water.covers(xyz)] = WATER
         return hag, kind
@@ -262,7 +263,7 @@ def _write_models(area: _Area) -> None:
         if path is not None:
             with written_aside(path) as aside:
                 geotiff.write(aside, grid, crs, geotiff.Band(name, "m" if metres.plain else ""), block(sheet))
-    found = outlines(np.asarray(area.roof.values) > 0, area.grid)
+    found = roof_outlines(area.roof)
     area.made.buildings = len(found)
     if task.buildings is not None:
         heights = [_height_within(area, each) for each in found]
@@ -279,8 +280,10 @@ def _height_within(area: _Area, polygon: Any) -> float:
     low_x, low_y, high_x, high_y = polygon.bounds
     left, right = int((low_x - grid.west_m) / grid.cell_m), int((high_x - grid.west_m) / grid.cell_m) + 1
     top, bottom = int((grid.north_m - high_y) / grid.cell_m), int((grid.north_m - low_y) / grid.cell_m) + 1
-    part = (slice(max(top, 0), bottom), slice(max(left, 0), right))
-    heights = area.canopy.values[part][area.roof.values[part] > 0]
+    top, left = max(top, 0), max(left, 0)
+    rows, columns = min(bottom, grid.rows) - top, min(right, grid.columns) - left
+    part = Window(grid.column + left, grid.row + grid.rows - top - rows, columns, rows)
+    heights = area.canopy.window(part)[area.roof.window(part) > 0]
     return float(np.nanmedian(heights)) if np.isfinite(heights).any() else float("nan")
 
 

@@ -12,10 +12,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
-from scipy.ndimage import binary_fill_holes, distance_transform_edt
+from scipy.ndimage import distance_transform_edt
 
 from flightlog.config import option
 from flightlog.errors import CoverageError, UsageError
+from groundproc.analysis.passage.enclosed import enclosed
 from groundproc.analysis.passage.relief import REACH, planes, steps
 from groundproc.analysis.passage.route import MOST_CELLS, Cell, best_route
 from groundproc.analysis.terrain.floor import Floor
@@ -124,8 +125,9 @@ class _Area:
             bare = xyz[kind == GROUND]
             ground.add(bare, bare[:, 2])
             # where in its cell the mean of its points lies: on a slope that moves their mean height
-            within = bare[:, :2] / cell_m
-            within -= np.floor(within) + 0.5
+            within = bare[:, :2] * (1.0 / cell_m)
+            within[:, 0] -= np.floor(within[:, 0]) + 0.5
+            within[:, 1] -= np.ceil(within[:, 1]) - 0.5  # as cells have it: a point on an edge is of the southern one
             east.add(bare, within[:, 0] * cell_m)
             north.add(bare, within[:, 1] * cell_m)
             below = ~noise & (above < task.vehicle.height_m) & (kind != HIGH_NOISE) & (kind != LOW_NOISE)
@@ -134,11 +136,11 @@ class _Area:
         grid = seen.grid()
         assert grid is not None
         self.grid = grid
-        self._ground, self._within, self._top = ground, (east, north), top
+        self._ground, self._within, self._top, self._seen = ground, (east, north), top, seen
         folder = task.folder
         self.slope, self.step = Sheet(grid, folder), Sheet(grid, folder)
         self.obstacle, self.height = Sheet(grid, folder), Sheet(grid, folder)
-        self.kind = np.zeros((grid.rows, grid.columns), np.uint8)
+        self.kind = Sheet(grid, folder, np.uint8)
         self._relief()
         self._classes()
 
@@ -146,6 +148,8 @@ class _Area:
         vehicle, cell_m = self.task.vehicle, self.grid.cell_m
         radius = max(round(vehicle.width_m / 2.0 / cell_m), 1)
         for block, around, cut in blocks(self.grid, 2 * radius + REACH + 1):
+            if not self._seen.holds(around):
+                continue
             mean = self._ground.window(around, "mean").astype(np.float64)
             first = planes(mean, cell_m, radius)
             beside = [cells.window(around, "mean") for cells in self._within]
@@ -176,50 +180,55 @@ class _Area:
         return np.where(np.isfinite(floor), floor, otherwise)
 
     def _classes(self) -> None:
-        vehicle, kind = self.task.vehicle, self.kind
-        known = np.isfinite(self.slope.values)
-        kind[known] = PASSABLE
-        kind[known & (self.slope.values > vehicle.max_slope_deg)] = STEEP
-        kind[self.step.values > vehicle.max_step_m] = STEP
-        kind[self.obstacle.values > vehicle.max_obstacle_m] = OBSTACLE
+        vehicle = self.task.vehicle
+        for block, _, _ in blocks(self.grid, 0):
+            if self.slope.holds(block):
+                slope = self.slope.window(block)
+                kind = np.where(np.isfinite(slope), PASSABLE, 0).astype(np.uint8)
+                kind[slope > vehicle.max_slope_deg] = STEEP
+                kind[self.step.window(block) > vehicle.max_step_m] = STEP
+                kind[self.obstacle.window(block) > vehicle.max_obstacle_m] = OBSTACLE
+                self.kind.put(block, kind)
         halo = int(np.ceil(vehicle.width_m / 2.0 / self.grid.cell_m)) + 1
-        closed = (kind != PASSABLE) & (kind != STEEP)
-        narrow = np.zeros(kind.shape, np.bool_)
-        for block, around, cut in blocks(self.grid, halo):
-            some = closed[self._slices(around)]
-            if some.any():
-                # a cell's own edge lies half a cell from its middle
-                away_m = np.asarray(distance_transform_edt(~some)) * self.grid.cell_m - 0.5 * self.grid.cell_m
-                narrow[self._slices(block)] = cut(away_m < vehicle.width_m / 2.0)
-        kind[narrow & ((kind == PASSABLE) | (kind == STEEP))] = NARROW
-
-    def _slices(self, window: Window) -> tuple[slice, slice]:
-        top = self.grid.row + self.grid.rows - window.row - window.rows
-        left = window.column - self.grid.column
-        return slice(top, top + window.rows), slice(left, left + window.columns)
+        narrow = Sheet(self.grid, self.task.folder, np.uint8)
+        for block, _, _ in blocks(self.grid, 0):
+            if self.kind.holds(block):
+                # beyond the raster nobody has looked either
+                around = self.kind.window(block.grown(halo))
+                closed = (around != PASSABLE) & (around != STEEP)
+                if closed.any():
+                    # a cell's own edge lies half a cell from its middle
+                    away_m = np.asarray(distance_transform_edt(~closed)) * self.grid.cell_m - 0.5 * self.grid.cell_m
+                    near = ~closed & (away_m < vehicle.width_m / 2.0)
+                    narrow.put(block, near[halo:-halo, halo:-halo].astype(np.uint8))
+        for block, _, _ in blocks(self.grid, 0):
+            if narrow.holds(block):
+                self.kind.put(block, np.where(narrow.window(block) > 0, np.uint8(NARROW), self.kind.window(block)))
 
     def areas(self) -> dict[str, float]:
         """By what cells are [m2]."""
         cell_m2 = self.grid.cell_m**2
-        found = {name: float((self.kind == number).sum() * cell_m2) for number, name in NAMES.items()}
-        amid = np.asarray(binary_fill_holes(self.kind > 0)) & (self.kind == 0)
-        return found | {"unseen": float(amid.sum() * cell_m2)}
+        counts = np.zeros(NARROW + 1, np.int64)
+        for block, _, _ in blocks(self.grid, 0):
+            if self.kind.holds(block):
+                counts += np.bincount(self.kind.window(block).ravel(), minlength=NARROW + 1)
+        found = {name: float(counts[number] * cell_m2) for number, name in NAMES.items()}
+        return found | {"unseen": float(enclosed(self.kind) * cell_m2)}
 
     def route(self) -> tuple[Any, dict[str, float]] | None:
         """The best way from end to end as a line, and figures of it."""
         assert self.task.ends is not None
         start, end = (self._cell(place, word) for place, word in zip(self.task.ends, ("--from", "--to"), strict=True))
-        if int((self.kind == PASSABLE).sum()) > MOST_CELLS:
+        row, column, steep = self._free()
+        if len(row) > MOST_CELLS:
             raise UsageError(
-                f"a route over {int((self.kind == PASSABLE).sum()):,} cells asked for, expected {MOST_CELLS:,} at most; "
-                "choose larger cells with --cell"
+                f"a route over {len(row):,} cells asked for, expected {MOST_CELLS:,} at most; choose larger cells with --cell"
             )
-        steep = self.slope.values / self.task.vehicle.max_slope_deg
-        way = best_route(np.where(self.kind == PASSABLE, 1.0 + steep**2, np.nan), start, end)
+        way = best_route((row, column), 1.0 + (steep / self.task.vehicle.max_slope_deg) ** 2, start, end)
         if way is None:
             return None
         row, column = way.T
-        height = self.height.values[row, column].astype(np.float64)
+        height = self.height.at(row, column).astype(np.float64)
         places = np.stack([
             self.grid.west_m + (column + 0.5) * self.grid.cell_m, self.grid.north_m - (row + 0.5) * self.grid.cell_m, height
         ], axis=1)  # fmt: skip
@@ -227,13 +236,26 @@ class _Area:
         figures = {
             "length_m": float(np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1).sum()),
             "rise_m": float(climbs[climbs > 0].sum()), "fall_m": float(-climbs[climbs < 0].sum()),
-            "steepest_deg": float(self.slope.values[row, column].max()),
-            "highest_step_m": float(np.nanmax(self.step.values[row, column], initial=0.0)),
-            "highest_obstacle_m": float(np.nanmax(self.obstacle.values[row, column], initial=0.0)),
+            "steepest_deg": float(self.slope.at(row, column).max()),
+            "highest_step_m": float(np.nanmax(self.step.at(row, column), initial=0.0)),
+            "highest_obstacle_m": float(np.nanmax(self.obstacle.at(row, column), initial=0.0)),
         }  # fmt: skip
         if len(places) == 1:
             places = np.repeat(places, 2, axis=0)
         return shapely.LineString(self.floor.metres.back(places)), figures
+
+    def _free(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Rows and columns of passable cells, in the order of rows, and their slopes [deg]."""
+        parts, grid = [np.empty((0, 3))], self.grid
+        for block, _, _ in blocks(self.grid, 0):
+            if self.kind.holds(block):
+                down, right = np.nonzero(self.kind.window(block) == PASSABLE)
+                top, left = grid.row + grid.rows - block.row - block.rows, block.column - grid.column
+                slope = self.slope.window(block)[down, right]
+                parts.append(np.column_stack([down + top, right + left, slope]))
+        found = np.concatenate(parts)
+        found = found[np.lexsort((found[:, 1], found[:, 0]))]
+        return found[:, 0].astype(np.int64), found[:, 1].astype(np.int64), found[:, 2]
 
     def _cell(self, place: tuple[float, float], word: str) -> Cell:
         """Row and column of a place, which has to be passable."""
@@ -246,13 +268,14 @@ class _Area:
                 f"{(grid.west_m + grid.columns * grid.cell_m) / across:.0f} E and "
                 f"{(grid.north_m - grid.rows * grid.cell_m) / across:.0f} to {grid.north_m / across:.0f} N"
             )
-        if self.kind[row, column] != PASSABLE:
-            free = np.argwhere(self.kind == PASSABLE)
+        kind = int(self.kind.at(np.array([row]), np.array([column]))[0])
+        if kind != PASSABLE:
+            free = np.column_stack(self._free()[:2])
             if not len(free):
                 raise CoverageError(f"{word} {place[0]:.2f},{place[1]:.2f}: no cell of the cloud is passable")
             near = free[int(np.argmin(((free - (row, column)) ** 2).sum(axis=1)))]
             east, north = grid.west_m + (near[1] + 0.5) * grid.cell_m, grid.north_m - (near[0] + 0.5) * grid.cell_m
-            why = NAMES.get(int(self.kind[row, column]), "unseen")
+            why = NAMES.get(kind, "unseen")
             raise CoverageError(
                 f"{word} {place[0]:.2f},{place[1]:.2f}: there is {why}, expected a passable place; the nearest is "
                 f"{east / across:.2f},{north / across:.2f}"
@@ -298,7 +321,7 @@ def _write_rasters(folder: Path, area: _Area) -> None:
     kinds = "1 passable, 2 steep, 3 step, 4 obstacle, 5 narrow"
     with written_aside(folder / FILES[0]) as aside:
         band = geotiff.Band(kinds, "", "uint8", 0, "nearest")
-        geotiff.write(aside, grid, crs, band, lambda window: area.kind[area._slices(window)])
+        geotiff.write(aside, grid, crs, band, area.kind.window)
     for name, title, unit, sheet in (
         ("slope.tif", "slope of the ground", "deg", area.slope),
         ("step.tif", "step of the ground", "m", area.step),

@@ -74,8 +74,10 @@ def section(
     metres = metres_of(cloud)
     start, end = (metres.across * np.array(each, np.float64) for each in (line_m[:2], line_m[2:]))
     length = float(np.linalg.norm(end - start))
-    if not (length > 0.0 and width_m > 0.0):
-        raise UsageError(f"a line of {length:g} m and a width of {width_m:g} m: expected more than 0 of both")
+    if not (length > 0.0 and 0.0 < width_m < np.inf):
+        raise UsageError(
+            f"a line of {length:g} m and a width of {width_m:g} m: expected more than 0 of both, and finite"
+        )
     ahead = (end - start) / length
     kept, left_out, low, high = 0, 0, np.inf, -np.inf
     bounds = [np.full(2, np.inf), np.full(2, -np.inf)]

@@ -7,36 +7,43 @@ import numpy as np
 
 from flightlog.errors import UsageError
 from groundproc.cloud import reader
+from groundproc.cloud.metres import metres_of
 from groundproc.files import written_aside
 
 _MOST: Final = 300_000
 """Points that are drawn."""
 
 
-def draw(cloud_path: Path, picture: Path, colour: str) -> None:
-    """Draw a cloud that `section` wrote.
+def check_colour(cloud: reader.Cloud, colour: str) -> None:
+    """See that points of a section have an attribute, before one is cut.
 
     Raises
     ------
     UsageError
-        Its points have no such attribute.
     """
+    known = ("z", *dict.fromkeys([*cloud.columns, "along"]))
+    if colour not in known:
+        raise UsageError(f"--colour {colour}: expected one of {', '.join(known)}")
+
+
+def draw(cloud_path: Path, picture: Path, colour: str) -> None:
+    """Draw a cloud that `section` wrote: way and height in metres, whatever the unit of its CRS."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     cloud = reader.look(cloud_path)
-    if colour != "z" and colour not in cloud.columns:
-        raise UsageError(f"--colour {colour}: expected z or one of {', '.join(cloud.columns)}")
+    metres = metres_of(cloud)
     step = max(1, -(-cloud.points // _MOST))
     along, height, value = [], [], []
     for chunk in reader.chunks(cloud, columns=("along", colour) if colour != "z" else ("along",)):
         along.append(chunk.points["along"][::step])
-        height.append(chunk.points.xyz_m[::step, 2])
+        height.append(metres.of(chunk.points.xyz_m)[::step, 2])
         value.append(height[-1] if colour == "z" else chunk.points[colour][::step].astype(np.float64))
     x, z, c = np.concatenate(along), np.concatenate(height), np.concatenate(value)
-    wide = float(np.clip(10.0 * np.ptp(x) / max(np.ptp(x), 2.0 * np.ptp(z)), 6.0, 10.0))
+    long, high = float(np.ptp(x)), float(np.ptp(z))
+    wide = float(np.clip(10.0 * long / max(long, 2.0 * high, 1e-9), 6.0, 10.0))
     figure, axes = plt.subplots(figsize=(wide, 4.5))
     drawn = axes.scatter(x, z, c=c, s=1.0, cmap="viridis")
     axes.set_aspect("equal", adjustable="datalim")

@@ -27,8 +27,7 @@ from groundproc.cloud.classes import GROUND, NO_SURFACE, PANE, UNCLASSIFIED
 from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tile, Tiles, side_for
 from groundproc.files import written_aside
-from groundproc.raster.grid import Grid
-from groundproc.raster.sampling import bilinear
+from groundproc.raster.grid import Grid, Window
 from groundproc.vectors.features import Features, write_features
 
 Array = npt.NDArray[np.float64]
@@ -223,7 +222,7 @@ def _mark(standing: Sheet, xyz: Array) -> None:
     column = np.floor((xyz[:, 0] - grid.west_m) / grid.cell_m).astype(np.int64)
     down = np.floor((grid.north_m - xyz[:, 1]) / grid.cell_m).astype(np.int64)
     inside = (column >= 0) & (column < grid.columns) & (down >= 0) & (down < grid.rows)
-    standing.values[down[inside], column[inside]] = 1
+    standing.mark(down[inside], column[inside], 1)
 
 
 def _open(standing: Sheet, xy: Array, reach_m: float) -> npt.NDArray[np.bool_]:
@@ -234,7 +233,10 @@ def _open(standing: Sheet, xy: Array, reach_m: float) -> npt.NDArray[np.bool_]:
     low, high = np.floor([down.min(), column.min()]), np.ceil([down.max(), column.max()])
     pad = int(np.ceil(reach_m / grid.cell_m)) + 1
     top, left = (max(int(each) - pad, 0) for each in low)
-    part = np.asarray(standing.values[top : int(high[0]) + pad, left : int(high[1]) + pad]) > 0
+    rows, columns = min(int(high[0]) + pad, grid.rows) - top, min(int(high[1]) + pad, grid.columns) - left
+    if rows <= 0 or columns <= 0:
+        return out
+    part = standing.window(Window(grid.column + left, grid.row + grid.rows - top - rows, columns, rows)) > 0
     if not part.any():
         return out
     # from the middle of a cell with a thing in it: half a cell more is certain to be of it
@@ -280,9 +282,9 @@ def _field(tile: Tile, floor: Floor, standing: Sheet, cell_m: float, epochs: int
     grid = Grid(int(low[0]), int(low[1]), columns, rows, cell_m)
     key = (cell[:, 1] - low[1]) * columns + cell[:, 0] - low[0]
     # above a smooth surface, which is added again in the middle: a slope within a cell does no harm
-    over = tile.xyz_m[:, 2] - bilinear(floor.base.values, floor.grid, tile.xyz_m)
+    over = tile.xyz_m[:, 2] - floor.base.bilinear(tile.xyz_m)
     middles = _middles(grid)
-    level = bilinear(floor.base.values, floor.grid, middles) if epochs == 1 else 0.0
+    level = floor.base.bilinear(middles) if epochs == 1 else 0.0
     parts = []
     for epoch in range(epochs):
         some = tile.columns["epoch"] == epoch
@@ -326,7 +328,7 @@ def _of_tile(tile: Tile, grid: Grid, cells: Field, floor: Floor, task: Task) -> 
         shapes = outlines(patch.cells[::-1], grid)
         if not shapes:
             continue
-        z = float(bilinear(floor.base.values, floor.grid, xy[None])[0])
+        z = float(floor.base.bilinear(xy[None])[0])
         outline = max(shapes, key=lambda each: each.area)
         area = float(patch.cells.sum()) * grid.cell_m**2
         found.append(Place(patch, outline, np.array([*xy, z]), area))

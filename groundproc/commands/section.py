@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from groundproc.analysis.section import CLOUD_ENDINGS, ENDINGS, section
+    from groundproc.analysis.sectionplot import check_colour
     from groundproc.cloud import reader
     from groundproc.cloud.metres import unstated
     from groundproc.commands.figures import warn
@@ -51,6 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     for path, suffix in ((arguments.json, ".json"), (arguments.picture, ".png")):
         if path is not None:
             claim_file(path, (suffix,), arguments.force)
+    if arguments.picture is not None:
+        check_colour(reader.look(arguments.cloud), arguments.colour)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
         made = section(arguments.cloud, arguments.output, line, arguments.width, bar.update, arguments.all_classes)
         if arguments.picture is not None:

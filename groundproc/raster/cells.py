@@ -83,6 +83,22 @@ class Cells:
         column, row = int((x + left).min()), int((y + low).min())
         return Grid(column, row, int((x + right).max()) - column + 1, int((y + high).max()) - row + 1, self.cell_m)
 
+    def holds(self, window: Window) -> bool:
+        """Whether there may be a value in some cells: whether they reach into a tile that was made."""
+        rows = range(window.row >> _BITS, (window.row + window.rows - 1 >> _BITS) + 1)
+        columns = range(window.column >> _BITS, (window.column + window.columns - 1 >> _BITS) + 1)
+        return any((x, y) in self._tiles for y in rows for x in columns)
+
+    def at(self, xyz_m: Array, statistic: str) -> npt.NDArray[np.float32]:
+        """A statistic of the cells that finite points lie in, shape (n,); NaN without values, a count then is 0."""
+        out = np.full(len(xyz_m), 0.0 if statistic == "count" else np.nan, np.float32)
+        placed = in_cells(xyz_m, self.cell_m)
+        for each, place in enumerate(placed.tiles):
+            some = placed.order[placed.first[each] : placed.first[each + 1]]
+            if place in self._tiles:
+                out[some] = self._tiles[place].statistic(statistic).ravel()[placed.within[some]]
+        return out
+
     def window(self, window: Window, statistic: str) -> npt.NDArray[np.float32]:
         """A statistic of some cells, shape (rows, columns), the first row in the north; NaN without values, a count then is 0."""
         out = np.full((window.rows, window.columns), 0.0 if statistic == "count" else np.nan, np.float32)

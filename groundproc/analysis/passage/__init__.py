@@ -1,1 +1,1 @@
-"""Where a vehicle can go: slope and steps of the ground (`relief`), what stands on it, and the best route (`route`)."""
+"""Where a vehicle can go: slope and steps of the ground (`relief`), what stands on it, what is `enclosed` unseen, the best `route`."""

@@ -10,7 +10,8 @@ from numba import njit
 from rasterio.transform import Affine
 from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label
 
-from groundproc.raster.grid import Grid
+from groundproc.analysis.terrain.surfaces import BLOCK, Sheet
+from groundproc.raster.grid import Grid, Window
 
 Raster = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -70,13 +71,42 @@ def _large(mask: Mask, cells: float) -> Mask:
 
 def outlines(mask: Mask, grid: Grid) -> list[Any]:
     """Outlines of pieces, as polygons whose edges do not follow the steps of the cells."""
-    transform = Affine(grid.cell_m, 0.0, grid.west_m, 0.0, -grid.cell_m, grid.north_m)
-    found = []
-    for shape, _ in rasterio.features.shapes(mask.astype(np.uint8), mask, connectivity=4, transform=transform):
-        polygon = shapely.geometry.shape(shape).simplify(0.75 * grid.cell_m)
-        if not polygon.is_empty and polygon.geom_type == "Polygon":
-            found.append(polygon)
-    return found
+    return _simple(_pieces(mask, grid, grid.cell_m), grid.cell_m)
+
+
+def roof_outlines(roof: Sheet) -> list[Any]:
+    """The same of a raster on the disk, block by block; a house that lies in several is one.
+
+    Parameters
+    ----------
+    roof : Sheet of uint8
+        1 where there is one.
+    """
+    found: list[Any] = []
+    cut: list[Any] = []
+    cell_m = roof.grid.cell_m
+    for block in roof.grid.blocks(BLOCK):
+        mask = roof.window(block) > 0 if roof.holds(block) else np.zeros((0, 0), np.bool_)
+        if mask.any():
+            west, south = block.column * cell_m, block.row * cell_m
+            rim = shapely.box(west, south, west + block.columns * cell_m, south + block.rows * cell_m).exterior
+            for polygon in _pieces(mask, block, cell_m):
+                (cut if polygon.intersects(rim) else found).append(polygon)
+    if cut:
+        found += shapely.get_parts(shapely.union_all(cut)).tolist()
+    return _simple(found, cell_m)
+
+
+def _pieces(mask: Mask, window: Window, cell_m: float) -> list[Any]:
+    """Polygons along the cells of pieces."""
+    transform = Affine(cell_m, 0.0, window.column * cell_m, 0.0, -cell_m, (window.row + window.rows) * cell_m)
+    shapes = rasterio.features.shapes(mask.astype(np.uint8), mask, connectivity=4, transform=transform)
+    return [shapely.geometry.shape(shape) for shape, _ in shapes]
+
+
+def _simple(polygons: list[Any], cell_m: float) -> list[Any]:
+    simple = [each.simplify(0.75 * cell_m) for each in polygons]
+    return [each for each in simple if not each.is_empty and each.geom_type == "Polygon"]
 
 
 @njit(cache=True, nogil=True)

@@ -22,7 +22,6 @@ from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, NO_SURFACE, 
 from groundproc.cloud.metres import metres_of
 from groundproc.raster.cells import Cells
 from groundproc.raster.grid import Grid, Window
-from groundproc.raster.sampling import bilinear
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int], object]
@@ -126,6 +125,8 @@ class Floor:
         halo_m = max(2.0 * settings.window_m + 4.0 * settings.smoothing_m + FILL_M, HALO_M if settings.hall_m else 0.0)
         halo = round(halo_m / settings.cell_m)
         for block, around, cut in blocks(self.grid, halo):
+            if not lowest.holds(_finer(block, times)):
+                continue
             values = _least(lowest, around, times)
             if np.isfinite(cut(values)).any():
                 bare = bare_ground(values, settings)
@@ -135,12 +136,12 @@ class Floor:
 
     def above(self, xyz: Array) -> npt.NDArray[np.float32]:
         """Height above the lowest ground, shape (n,)."""
-        return (xyz[:, 2] - bilinear(self.height.values, self.grid, xyz)).astype(np.float32)
+        return (xyz[:, 2] - self.height.bilinear(xyz)).astype(np.float32)
 
     def heights(self, xyz: Array, noise: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
         """Height above the lowest ground, and class as far as height tells it: ground, noise, or something above the ground."""
         above = self.above(xyz)
-        reach = bilinear(self.reach.values, self.grid, xyz)
+        reach = self.reach.bilinear(xyz)
         kind = np.full(len(xyz), UNCLASSIFIED, np.uint8)
         kind[np.abs(above) <= reach] = GROUND
         kind[above < -np.maximum(reach, LEAST_DEPTH_M)] = LOW_NOISE
@@ -155,6 +156,8 @@ def _density(cells: Cells, grid: Grid) -> float:
     times = max(round(COARSE_M / cells.cell_m), 1)
     points, seen = 0.0, 0
     for block, _, _ in blocks(_coarser(grid, times, cells.cell_m * times), 0):
+        if not cells.holds(_finer(block, times)):
+            continue
         count = cells.window(_finer(block, times), "count").astype(np.float64)
         count = count.reshape(block.rows, times, block.columns, times).sum(axis=(1, 3))
         points, seen = points + float(count.sum()), seen + int((count > 0).sum())

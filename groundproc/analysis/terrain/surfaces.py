@@ -1,4 +1,4 @@
-"""Rasters of whole areas on the disk, filled block by block."""
+"""Rasters of areas on the disk, filled block by block."""
 
 import tempfile
 import weakref
@@ -8,7 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
+from groundproc.numerics.layout import to_read
 from groundproc.raster.grid import Grid, Window
 
 BLOCK: Final = 1024
@@ -16,7 +18,9 @@ BLOCK: Final = 1024
 
 
 class Sheet:
-    """One value for each cell of a grid, in a temporary file without a name.
+    """One value for each cell of a grid, in a temporary file without a name; only blocks that were filled take room.
+
+    A corridor that runs aslant fills little of its bounds, so memory and disk follow the blocks that hold something.
 
     Parameters
     ----------
@@ -27,34 +31,111 @@ class Sheet:
     """
 
     def __init__(self, grid: Grid, folder: Path, dtype: Any = np.float32) -> None:
-        file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open as long as this lives)
-        weakref.finalize(self, file.close)
-        self.grid = grid
-        self.values: npt.NDArray[Any] = np.memmap(file, dtype, "w+", shape=(grid.rows, grid.columns))
-        """Shape (rows, columns), the first row in the north."""
-        if np.dtype(dtype).kind == "f":
-            self.values[:] = np.nan
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open as long as this lives)
+        weakref.finalize(self, self._file.close)
+        self.grid, self._dtype = grid, np.dtype(dtype)
+        self._none: float = np.nan if self._dtype.kind == "f" else 0
+        self._slot = np.full((-(-grid.rows // BLOCK), -(-grid.columns // BLOCK)), -1, np.int64)
+        self._filled = 0
+        self._blocks: npt.NDArray[Any] = np.empty((0, BLOCK, BLOCK), self._dtype)
 
     def put(self, window: Window, values: npt.NDArray[Any]) -> None:
         """Fill a window that lies within the grid."""
-        rows, columns = self._slices(window)
-        self.values[rows, columns] = values
+        for key, inside, part in self._parts(window):
+            self._block(key)[inside] = values[part]
+
+    def mark(self, down: npt.NDArray[np.int64], right: npt.NDArray[np.int64], value: Any) -> None:
+        """Give cells a value, by their rows from the north and columns from the west, shape (n,)."""
+        blocks = np.unique(down // BLOCK * self._slot.shape[1] + right // BLOCK)
+        for each in blocks:
+            self._block(divmod(int(each), self._slot.shape[1]))
+        self._blocks[self._slot[down // BLOCK, right // BLOCK], down % BLOCK, right % BLOCK] = value
 
     def window(self, window: Window) -> npt.NDArray[Any]:
         """A copy of a window; beyond the grid NaN, or 0."""
-        out = np.full((window.rows, window.columns), np.nan if self.values.dtype.kind == "f" else 0, self.values.dtype)
+        out = np.full((window.rows, window.columns), self._none, self._dtype)
         inner = within(self.grid, window)
         if inner is not None:
-            rows, columns = self._slices(inner)
             top = window.row + window.rows - inner.row - inner.rows
             left = inner.column - window.column
-            out[top : top + inner.rows, left : left + inner.columns] = self.values[rows, columns]
+            target = out[top : top + inner.rows, left : left + inner.columns]
+            for key, inside, part in self._parts(inner):
+                if self._slot[key] >= 0:
+                    target[part] = self._blocks[self._slot[key]][inside]
         return out
 
-    def _slices(self, window: Window) -> tuple[slice, slice]:
-        top = self.grid.row + self.grid.rows - window.row - window.rows
-        left = window.column - self.grid.column
-        return slice(top, top + window.rows), slice(left, left + window.columns)
+    def holds(self, window: Window) -> bool:
+        """Whether anything was filled in a block that a window reaches into."""
+        inner = within(self.grid, window)
+        return inner is not None and any(self._slot[key] >= 0 for key, _, _ in self._parts(inner))
+
+    def at(self, down: npt.NDArray[np.int64], right: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
+        """Values of cells, by their rows from the north and columns from the west, shape (n,)."""
+        slot = self._slot[down // BLOCK, right // BLOCK]
+        out = np.full(slot.shape, self._none, self._dtype)
+        known = slot >= 0
+        out[known] = self._blocks[slot[known], down[known] % BLOCK, right[known] % BLOCK]
+        return out
+
+    def bilinear(self, xyz_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+        """Values between the centres of cells, shape (n,), as `sampling.bilinear` has them of a whole raster."""
+        grid = self.grid
+        frame = (grid.west_m, grid.north_m, grid.cell_m, grid.rows, grid.columns)
+        return np.asarray(_bilinear(to_read(self._blocks), self._slot, frame, to_read(xyz_m)))
+
+    def _block(self, key: tuple[int, int]) -> npt.NDArray[Any]:
+        """A block to be filled, shape (BLOCK, BLOCK)."""
+        if self._slot[key] < 0:
+            if self._filled == len(self._blocks):
+                count = min(max(2 * self._filled, 1), self._slot.size)
+                self._file.truncate(count * BLOCK * BLOCK * self._dtype.itemsize)
+                self._blocks = np.memmap(self._file, self._dtype, "r+", shape=(count, BLOCK, BLOCK))
+            self._slot[key] = self._filled
+            self._filled += 1
+            if self._dtype.kind == "f":
+                rows, columns = (
+                    side - BLOCK * at for side, at in zip((self.grid.rows, self.grid.columns), key, strict=True)
+                )
+                self._blocks[self._slot[key], :rows, :columns] = self._none
+        found: npt.NDArray[Any] = self._blocks[self._slot[key]]
+        return found
+
+    def _parts(self, window: Window) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
+        """Blocks that a window within the grid reaches into: which, the part of the block, and the part of the window."""
+        top, left = self.grid.row + self.grid.rows - window.row - window.rows, window.column - self.grid.column
+        for i in range(top // BLOCK, (top + window.rows - 1) // BLOCK + 1):
+            first, last = max(top, i * BLOCK), min(top + window.rows, (i + 1) * BLOCK)
+            for j in range(left // BLOCK, (left + window.columns - 1) // BLOCK + 1):
+                west, east = max(left, j * BLOCK), min(left + window.columns, (j + 1) * BLOCK)
+                yield (
+                    (i, j),
+                    (slice(first - i * BLOCK, last - i * BLOCK), slice(west - j * BLOCK, east - j * BLOCK)),
+                    (slice(first - top, last - top), slice(west - left, east - left)),
+                )
+
+
+@njit(cache=True, nogil=True)
+def _bilinear(blocks: Any, slot: Any, frame: Any, xyz: Any) -> Any:
+    west, north, cell, rows, columns = frame
+    out = np.empty(len(xyz), np.float32)
+    for n in range(len(xyz)):
+        u = min(max((xyz[n, 0] - west) / cell - 0.5, 0.0), columns - 1.0)
+        v = min(max((north - xyz[n, 1]) / cell - 0.5, 0.0), rows - 1.0)
+        j, i = int(u), int(v)
+        j2, i2 = min(j + 1, columns - 1), min(i + 1, rows - 1)
+        fu, fv = u - j, v - i
+        total, weight = 0.0, 0.0
+        for a, b, w in (
+            (i, j, (1.0 - fu) * (1.0 - fv)), (i, j2, fu * (1.0 - fv)), (i2, j, (1.0 - fu) * fv), (i2, j2, fu * fv),
+        ):  # fmt: skip
+            number = slot[a // BLOCK, b // BLOCK]
+            if number >= 0:
+                value = blocks[number, a % BLOCK, b % BLOCK]
+                if value == value:
+                    total += w * value
+                    weight += w
+        out[n] = total / weight if weight > 0.0 else np.nan
+    return out
 
 
 def within(grid: Grid, window: Window) -> Window | None:

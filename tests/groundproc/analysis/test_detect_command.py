@@ -14,7 +14,6 @@ import rasterio
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cli import main
 from groundproc.cloud import reader
-from groundproc.raster.sampling import bilinear
 from simulator import outdoors
 
 ORIGIN = np.array([533_000.0, 6_472_000.0, 0.0])
@@ -112,7 +111,7 @@ def test_cars_put_into_a_real_wood_are_found_at_five_false_alarms_a_hectare(tmp_
     las = laspy.read(source)
     floor = Floor(reader.look(source), tmp_path, lambda done: None)
     xyz = np.ascontiguousarray(las.xyz)
-    above = xyz[:, 2] - bilinear(floor.base.values, floor.grid, xyz)
+    above = xyz[:, 2] - floor.base.bilinear(xyz)
     las.z, boxes = (lambda found: (found[0][:, 2], found[1]))(outdoors.with_vehicles(xyz, above, 1, 40))
     las.write(tmp_path / "c.laz")
     assert main(["detect", str(tmp_path / "c.laz"), "-o", str(tmp_path / "o.geojson")]) == 0

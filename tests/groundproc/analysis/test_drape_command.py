@@ -182,3 +182,20 @@ def test_bad_wishes_are_one_sentence(
     assert said in err
     assert "\n" not in err
     assert not (tmp_path / "o.laz").exists()
+
+
+def test_every_point_of_level_ground_is_uppermost_and_one_far_away_does_no_harm(tmp_path: Path) -> None:
+    """Points on edges of cells, of a cloud with a stray point 400 km off."""
+    x, y = np.meshgrid(np.arange(2.0, 30.0, 0.5), np.arange(2.0, 30.0, 0.5))
+    xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)])
+    write_cloud(tmp_path / "c.laz", np.vstack([xyz, [400_000.0, 700_000.0, 3.0]]))
+    with rasterio.open(
+        tmp_path / "t.tif", "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="float32", crs="EPSG:32633",
+        transform=from_origin(ORIGIN[0], ORIGIN[1] + SIDE, 1.0, 1.0),
+    ) as file:  # fmt: skip
+        file.write(np.full((SIDE, SIDE), 20.0, np.float32), 1)
+    words = ["drape", str(tmp_path / "c.laz"), str(tmp_path / "t.tif"), "--as", "temperature"]
+    assert main([*words, "-o", str(tmp_path / "o.laz"), "--json", str(tmp_path / "f.json")]) == 0
+    figures = json.loads((tmp_path / "f.json").read_text())
+    assert (figures["draped"], figures["below_the_top"], figures["outside_or_without_value"]) == (len(xyz), 0, 1)
+    assert (np.asarray(laspy.read(tmp_path / "o.laz")["temperature"])[:-1] == 20.0).all()

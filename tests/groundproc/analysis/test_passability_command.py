@@ -167,6 +167,20 @@ def test_where_there_is_no_way_it_is_said(made: Path, tmp_path: Path, capsys: py
     assert not (tmp_path / "out" / "route.geojson").exists()
 
 
+def test_nothing_goes_half_beyond_what_was_seen(tmp_path: Path) -> None:
+    """The edge of the cloud is as closed as a hole in it, on all four sides."""
+    xy = np.random.default_rng(2).uniform(0.05, 19.95, (30_000, 2))
+    write_cloud(tmp_path / "c.laz", np.column_stack([xy, np.zeros(len(xy))]))
+    assert (
+        main(["passability", str(tmp_path / "c.laz"), "-o", str(tmp_path / "o"), "--json", str(tmp_path / "f.json")])
+        == 0
+    )
+    for x, y, true in ((0.4, 10, 5), (19.6, 10, 5), (10, 0.4, 5), (10, 19.6, 5), (1.6, 10, 1), (10, 18.4, 1)):
+        assert value(tmp_path / "o" / "passability.tif", x, y) == true, (x, y)
+    area = json.loads((tmp_path / "f.json").read_text())["area_m2"]
+    assert area["passable"] == pytest.approx(18.0**2, rel=0.06)
+
+
 # On arrays -----------------------------------------------------------------------------------------------------------
 
 
@@ -209,7 +223,8 @@ def test_the_best_route_is_that_of_a_plain_search() -> None:
                         least[i, j] = min(least[i, j], least[k, m] + np.hypot(di, dj) * (cost[i, j] + cost[k, m]) / 2)
             if turn > 60:
                 break
-        way = best_route(cost, (0, 0), (11, 13))
+        row, column = np.nonzero(np.isfinite(cost))
+        way = best_route((row, column), cost[row, column], (0, 0), (11, 13))
         if way is None:
             assert np.isinf(least[-1, -1])
             continue

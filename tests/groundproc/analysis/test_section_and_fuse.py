@@ -7,6 +7,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from groundproc.analysis.registration import register
@@ -61,6 +62,42 @@ def test_a_section_keeps_what_lies_near_the_line(tmp_path: Path, capsys: pytest.
         assert main(["section", str(tmp_path / "a.laz"), "--line", line, "-o", str(tmp_path / "t.laz")]) in (1, 2)
         assert expected in capsys.readouterr().err
         assert not (tmp_path / "t.laz").exists()
+
+
+def test_a_picture_of_feet_is_in_metres_and_of_one_station_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    xyz = np.column_stack([rng.uniform(0, 100, 500), np.zeros(500), rng.uniform(0, 50, 500)])  # in feet
+    write(tmp_path / "feet.laz", xyz, epsg=2277)
+    write(tmp_path / "one.laz", np.zeros((1, 3)))
+    drawn: list[np.ndarray] = []
+    plain = Axes.scatter
+    monkeypatch.setattr(Axes, "scatter", lambda self, x, z, **more: (drawn.append(z), plain(self, x, z, **more))[1])
+    for name in ("feet", "one"):
+        ends = f"{ORIGIN[0]},{ORIGIN[1]},{ORIGIN[0] + 100},{ORIGIN[1]}"
+        words = ["section", str(tmp_path / f"{name}.laz"), "--line", ends, "-o", str(tmp_path / f"{name}_s.laz")]
+        assert main([*words, "--picture", str(tmp_path / f"{name}.png")]) == 0
+    np.testing.assert_allclose(np.ptp(drawn[0]), np.ptp(xyz[:, 2]) * 1200 / 3937, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--colour", "nosuch", "--picture", "p.png"], "--colour nosuch: expected one of z, "),
+        (["--width", "inf"], "finite"),
+        (["--width", "nan"], "finite"),
+    ],
+)
+def test_a_section_that_cannot_be_leaves_nothing(
+    tmp_path: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "a.laz", np.zeros((3, 3)))
+    line = f"{ORIGIN[0]},{ORIGIN[1]},{ORIGIN[0] + 9},{ORIGIN[1]}"
+    words = [str(tmp_path / each) if each.endswith(".png") else each for each in words]
+    assert main(["section", str(tmp_path / "a.laz"), "--line", line, "-o", str(tmp_path / "s.laz"), *words]) == 2
+    assert said in capsys.readouterr().err
+    assert [each.name for each in tmp_path.iterdir()] == ["a.laz"]
 
 
 def surface(rng: np.random.Generator, count: int) -> np.ndarray:
