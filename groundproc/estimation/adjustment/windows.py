@@ -177,7 +177,7 @@ def adjust_window(
         previous = before[-1]
         previous.own = first - previous.first
         common = slice((first - previous.first) * STEPS, (first - previous.first + OVERLAP) * STEPS, STEPS)
-        tie = Tie(previous.path.quat[common], previous.path.position_m[common])
+        tie = Tie(previous.path.quat[common], previous.path.position_m[common], _walked(previous, first))
         path = _laid_on(path, tie)
     loops = closed_loops(path, track, first, last)
     path = loops.path
@@ -223,6 +223,14 @@ def corrections_over(windows: Sequence[Window]) -> tuple[Array, Array] | None:
     """Corrections of the lasers that all windows together give, and their covariance; None where they were no unknowns."""
     told = [window.corrections for window in windows if window.corrections is not None]
     return joined([o for o, _ in told], [square for _, square in told], lasers.PRIOR) if told else None
+
+
+def _walked(previous: Window, first: int) -> Array:
+    """Variance of a window's positions over its overlap with the next against the first of them [m^2], shape (OVERLAP, 3)."""
+    if previous.seen is None:
+        return np.zeros((OVERLAP, 3))
+    gained = previous.seen.stiffness.shift[first - previous.first :][: OVERLAP - 1] * H
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])
 
 
 def _laid_on(path: Path, tie: Tie) -> Path:

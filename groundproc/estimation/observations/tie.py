@@ -23,10 +23,14 @@ class Tie(Observation):
     ----------
     quat : ndarray, shape (n, 4)
     position_m : ndarray, shape (n, 3)
+    walk_m2 : ndarray, shape (n, 3)
+        Variance that the window before gives them against the first of them, east, north, up: along a street its end may be bent by
+        metres.
     """
 
     quat: Array
     position_m: Array
+    walk_m2: Array
     name: str = "tie"
 
     def factors(self, state: State, unknowns: Unknowns) -> list[Factor]:
@@ -50,5 +54,7 @@ def tie_factor(given: Tie, path: Path, unknowns: Unknowns) -> Factor:
     builder, knot = RowBuilder(6 * count, unknowns), np.arange(count)
     builder.at_knots(6 * knot, knot, 0, eye(count))
     builder.at_knots(6 * knot + 3, knot, 3, eye(count))
-    sigma = np.tile(np.repeat([TIE_SIGMA_RAD, TIE_SIGMA_M], 3), count)
-    return Factor("tie", residual.ravel(), builder.matrix(), sigma)
+    sigma = np.tile(np.repeat([TIE_SIGMA_RAD, TIE_SIGMA_M], 3), (count, 1))
+    # what the other's end is bent by is one error of all poses: they tell no more of it than a single one
+    sigma[:, 3:] = np.sqrt(sigma[:, 3:] ** 2 + count * given.walk_m2)
+    return Factor("tie", residual.ravel(), builder.matrix(), sigma.ravel())

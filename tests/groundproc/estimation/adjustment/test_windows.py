@@ -78,7 +78,7 @@ def test_three_windows_keep_their_places() -> None:
 
 def test_a_path_is_laid_on_the_begin_of_the_one_before_as_a_rigid_body() -> None:
     true = flown(30, 70)
-    tie = Tie(true.quat[: 10 * STEPS : STEPS], true.position_m[: 10 * STEPS : STEPS])
+    tie = Tie(true.quat[: 10 * STEPS : STEPS], true.position_m[: 10 * STEPS : STEPS], np.zeros((10, 3)))
     away = true.turned(Rotation.from_rotvec([0.01, -0.02, 0.3]).as_matrix(), np.array([5.0, -3.0, 2.0]))
     turn, place = off(_laid_on(away, tie), true)
     # the turn of the world is found exactly where it is the same everywhere

@@ -391,7 +391,9 @@ def test_what_a_tie_says_is_linear_as_stated(path: Path) -> None:
     rng, unknowns = np.random.default_rng(5), unknowns_of()
     quat, place = path.quat[: 5 * STEPS : STEPS], path.position_m[: 5 * STEPS : STEPS]
     tie = Tie(
-        frames.quat_multiply(quat, frames.quat_exp(1e-3 * rng.normal(size=(5, 3)))), place + rng.normal(size=(5, 3))
+        frames.quat_multiply(quat, frames.quat_exp(1e-3 * rng.normal(size=(5, 3)))),
+        place + rng.normal(size=(5, 3)),
+        rng.uniform(0.0, 1e-4, (5, 3)),
     )
 
     def residual(p: Path) -> Array:
@@ -401,6 +403,25 @@ def test_what_a_tie_says_is_linear_as_stated(path: Path) -> None:
     assert len(factor.residual) == 30
     for offset, share in ((0, 2e-3), (3, 1e-6)):
         assert_close(of_the_path(factor, offset), by_the_path(residual, path, offset, 1e-5), share)
+
+
+def test_a_tie_tells_no_more_of_a_speed_than_a_window_whose_end_walks_away(path: Path) -> None:
+    """Along a street the end of a window is bent by decimetres a second, and two hundred poses of it share that one error."""
+    count, rate_m2_s = 12, 0.05
+    unknowns, time_s = unknowns_of(), H * np.arange(count)
+    quat, place = path.quat[: count * STEPS : STEPS], path.position_m[: count * STEPS : STEPS]
+    walk_m2 = np.tile(rate_m2_s * time_s[:, None], 3)
+
+    def speed_sigma(walk: Array) -> float:
+        sigma = tie_factor(Tie(quat, place, walk), path, unknowns).sigma.reshape(count, 6)[:, 3]
+        return float(np.square(time_s / sigma).sum() ** -0.5)
+
+    # what a random walk that is looked at all the way along leaves of a constant speed
+    covariance = rate_m2_s * np.minimum(time_s[1:, None], time_s[1:])
+    honest = float((time_s[1:] @ np.linalg.solve(covariance, time_s[1:])) ** -0.5)
+    assert honest < speed_sigma(walk_m2) < 2.0 * honest
+    # and where the lidar holds the way, the two agree to a centimetre at each pose
+    assert speed_sigma(np.zeros((count, 3))) == pytest.approx(0.01 / np.sqrt(np.square(time_s).sum()))
 
 
 def test_a_delay_of_positions_and_attitudes_is_linear_as_stated(path: Path) -> None:
