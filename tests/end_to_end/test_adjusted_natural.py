@@ -11,6 +11,7 @@ from flightlog.logfile import LogReader
 from groundproc.accuracy.judge import Judgement, judge
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
+from groundproc.estimation.adjustment import adjusted, windows
 from groundproc.estimation.method import gather
 from groundproc.flight.flight import read_flight
 from groundproc.flight.pairing import legs
@@ -57,3 +58,26 @@ def test_in_time_the_odometry_keeps_the_way_over_a_meadow(meadow_flight: Any) ->
     later = found.courses["time_s"] > 6.0
     assert np.median(found.courses["position_error_m"][later]) <= 0.05
     assert np.median(found.courses["rotation_error_deg"][later]) <= 0.1
+
+
+# a flight of 26 s and two adjustments; in the quick suite: what a tie and a swinging step do (test_factors, test_batch)
+@pytest.mark.soak
+def test_along_an_empty_street_no_window_is_worse_than_the_smoother(
+    simulated: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Held by 1 cm to the end of the one before, whose speed along the street was not known, the last of three windows was 2.7 m off."""
+    from simulator.plans import plan
+
+    street = plan("emptystreet")
+    folder = simulated("street_windows", street.scene, 26.0, street.options, seed=21).folder
+    _, smoothed = judged(folder, Survey(method="filtered"))
+    made, whole = judged(folder, Survey())
+    assert "settled" not in made.warning
+    for module in (adjusted, windows):
+        monkeypatch.setattr(module, "OVERLAP", 30)
+    monkeypatch.setattr(adjusted, "WINDOW", 100)
+    made, parted = judged(folder, Survey())
+    assert len(made.report["windows"]) > 2
+    for found in (whole, parted):
+        assert found.figures["ate_m"] < smoothed.figures["ate_m"]
+        assert found.figures["position_within_2_sigma"] >= 0.95

@@ -27,6 +27,8 @@ ROUGH: Final = 1e-3
 MORE_ROUNDS: Final = 5
 SETTLED_M: Final = 0.003
 """The last step is repeated, at most so many times, until the path's shape moves by less than this, RMS."""
+SWINGS: Final = -0.5
+"""A step that takes back more than this share of the one before swings about where it leads: the next one is damped."""
 DRAWS: Final = 12
 """Draws of the path's error. The variance of the path in itself is right to two fifths, and better as a mean over a
 second."""
@@ -54,6 +56,10 @@ class Batch:
         What each step said.
     told : callable
         Called after each step.
+    last : ndarray, shape (slices + 1, 3), or None
+        What the step before would have moved the path's shape by [m].
+    share : float
+        How much of what is asked for is taken: less than all where steps swing.
     """
 
     path: Path
@@ -63,6 +69,8 @@ class Batch:
     free: float = 1.0
     log: list[dict[str, float]] = field(default_factory=list)
     told: Callable[[], None] = lambda: None
+    last: Array | None = None
+    share: float = 1.0
 
     def run(self, rounds: Sequence[tuple[float, bool]] = ROUNDS) -> Posterior:
         """All Gauss-Newton steps, and the posterior of the last."""
@@ -123,11 +131,25 @@ class Batch:
             | figures
         )  # fmt: skip
         before, clusters = self.path, self.lidar.clusters
-        self.take(unknowns, x)
-        moved = (self.path.position_m - before.position_m)[::STEPS]
-        self.log[-1]["moved_m"] = float(np.sqrt(np.square(moved - moved.mean(axis=0)).sum(axis=1).mean()))
+        asked = (corrected(before, unknowns, x).position_m - before.position_m)[::STEPS]
+        asked -= asked.mean(axis=0)
+        self._damp(asked)
+        self.take(unknowns, self.share * x)
+        self.log[-1]["moved_m"] = float(np.sqrt(np.square(asked).sum(axis=1).mean()))
         self.told()
         return Posterior(linear, unknowns, lambda: noise_of(rows, clusters, before, DEFLATION, factors, x))
+
+    def _damp(self, asked: Array) -> None:
+        """Take less of steps that swing to and fro, as much as would have ended the last swing (Irons and Tuck 1969).
+
+        What a slice does not tell is taken out of the rows' derivatives, but the rows feel it: a street that is moved along itself tilts
+        by a millidegree, and accelerometers make decimetres of that the other way.
+        """
+        if self.last is not None:
+            ratio = float((asked * self.last).sum()) / max(float(np.square(self.last).sum()), 1e-30)
+            if ratio < SWINGS:
+                self.share = self.share / (1.0 - ratio)
+        self.last = asked
 
     def take(self, unknowns: Unknowns, x: Array) -> None:
         """Put a solution in."""
