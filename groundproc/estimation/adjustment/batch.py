@@ -29,6 +29,8 @@ SETTLED_M: Final = 0.003
 """The last step is repeated, at most so many times, until the path's shape moves by less than this, RMS."""
 SWINGS: Final = -0.5
 """A step that takes back more than this share of the one before swings about where it leads: the next one is damped."""
+LEAST_SHARE: Final = 0.5
+"""Less of a step is not taken: what does not swing has to get where it leads within some steps."""
 DRAWS: Final = 12
 """Draws of the path's error. The variance of the path in itself is right to two fifths, and better as a mean over a
 second."""
@@ -148,7 +150,7 @@ class Batch:
         if self.last is not None:
             ratio = float((asked * self.last).sum()) / max(float(np.square(self.last).sum()), 1e-30)
             if ratio < SWINGS:
-                self.share = self.share / (1.0 - ratio)
+                self.share = max(self.share / (1.0 - ratio), LEAST_SHARE)
         self.last = asked
 
     def take(self, unknowns: Unknowns, x: Array) -> None:
