@@ -9,7 +9,9 @@ import numpy.typing as npt
 from scipy.ndimage import center_of_mass, find_objects, gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 
+from groundproc.analysis.corridor.thin import VOXEL_M, thin_points
 from groundproc.numerics.robust import sigma
+from groundproc.numerics.voxelhash import assign
 from groundproc.raster.cells import Cells
 from groundproc.raster.fill import fill
 from groundproc.raster.openings import dilated, eroded
@@ -33,6 +35,11 @@ _DEAD: Final = (0.4, 3.0)
 """Of the pulses into a dead crown more than this share go through, and so many sigmas more than through the usual one."""
 _PEAK_M: Final = 0.8
 _FEWEST: Final = 6
+_LINE_M: Final = 0.12
+"""A crown that scatters less than this to both sides, and so many times as far along, is a stretch of wire ..."""
+_LINE_RATIO: Final = 3.0
+_WIRE_M: Final = 4.0
+"""... if most of what is high within this of it lies on thin lines too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +114,30 @@ def crowns(xyz_m: Array, above_m: npt.NDArray[np.float32], least_m: float) -> li
         area = float((number[piece] == each + 1).sum()) * CELL_M**2
         peak = np.array([grid.west_m + (tops[each, 1] + 0.5) * CELL_M, grid.north_m - (tops[each, 0] + 0.5) * CELL_M])
         tree = _tree(xyz_m[some], above_m[some], (place, peak), area)
-        if tree.height_m >= least_m:
-            found.append(tree)
+        high = above_m[some] > 0.5 * tree.height_m
+        if tree.height_m < least_m:
+            continue
+        if not tree.stem and _a_line(xyz_m[some][high, :2]):
+            near = np.flatnonzero((above_m > 0.5 * least_m) & (np.hypot(*(xyz_m[:, :2] - tree.top).T) < _WIRE_M))
+            if len(thin_points(xyz_m[near], np.ones(len(near), np.bool_)).xyz_m) > 0.5 * _voxels(xyz_m[near]):
+                continue
+        found.append(tree)
     return found
+
+
+def _a_line(xy_m: Array) -> bool:
+    """Whether points lie along a line, seen from above, as those of a wire do."""
+    if len(xy_m) < 3:
+        return False
+    across, along = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(xy_m.T)), 0.0))
+    # a few points of a crown lie in a line by chance
+    widest_m = _LINE_M * min((len(xy_m) - 2) / (_FEWEST - 2), 1.0)
+    return bool(across < widest_m and along > _LINE_RATIO * across)
+
+
+def _voxels(xyz_m: Array) -> int:
+    """How many places `thin_points` looks at among some."""
+    return assign(xyz_m - np.floor(xyz_m.min(axis=0)), VOXEL_M)[1] if len(xyz_m) else 0
 
 
 def _tops(smooth: npt.NDArray[np.float32], least_m: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:

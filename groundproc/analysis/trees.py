@@ -14,17 +14,27 @@ import shapely
 from scipy.spatial import cKDTree
 
 from groundproc.analysis.crowns import Tree, crowns, dead
+from groundproc.analysis.terrain.building import roofs
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
+from groundproc.cloud.classes import BUILDING, HIGH_NOISE, OF_USES
 from groundproc.cloud.metres import unstated
 from groundproc.cloud.tiles import Tiles, side_for
 from groundproc.files import written_aside
+from groundproc.raster.cells import Cells
+from groundproc.raster.fill import fill
 from groundproc.vectors.features import Features, write_features
 
 BUSH_M: Final = 1.0
 TREE_M: Final = 3.0
 _HALO_M: Final = 10.0
+_BUILT: Final = (BUILDING, *OF_USES)
+"""Points that were classed as this before grow on no tree."""
+_FOOT_M: Final = 1.0
+"""What is lower may be ground or a bush at the foot of a wall."""
 _DEEPEST_M: Final = -1.0
+
+Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +90,16 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
         grid = floor.grid
         side = side_for(cloud.points, (0.0, 0.0), (grid.columns * grid.cell_m, grid.rows * grid.cell_m), _HALO_M)
         tiles = Tiles(task.output.parent, {"above": np.float32}, side, _HALO_M)
-        for _, xyz, noise in floor.pieces():
+        for record, xyz, noise in floor.pieces():
             above, kind = floor.heights(xyz, noise)
-            keep = (above > _DEEPEST_M) & (kind != 18) & ~noise
+            built = np.isin(np.asarray(record.classification), _BUILT) & (above > _FOOT_M)
+            _lay_down(xyz, above, built)
+            keep = (above > _DEEPEST_M) & (kind != HIGH_NOISE) & ~noise
             tiles.add(xyz[keep], {"above": above[keep]})
         for tile in tiles:
-            found = crowns(tile.xyz_m, tile.columns["above"], task.least_m)
+            above = tile.columns["above"]
+            _lay_down(tile.xyz_m, above, _on_roofs(tile.xyz_m, above, floor.settings.cell_m))
+            found = crowns(tile.xyz_m, above, task.least_m)
             if found:
                 # a tree is of the square that its highest point is in
                 places = np.array([each.top for each in found])
@@ -98,6 +112,26 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
     if not made.trees:
         made.warnings.append(f"nothing grows higher than {task.least_m:g} m")
     return made
+
+
+def _lay_down(xyz_m: Array, above_m: npt.NDArray[np.float32], built: npt.NDArray[np.bool_]) -> None:
+    """Put points of what was built on the ground below them, where no canopy is; in place."""
+    xyz_m[built, 2] -= above_m[built]
+    above_m[built] = 0.0
+
+
+def _on_roofs(xyz_m: Array, above_m: npt.NDArray[np.float32], cell_m: float) -> npt.NDArray[np.bool_]:
+    """Points on buildings, as `swath ground` tells them, shape (n,)."""
+    tops, ground = Cells(cell_m, {"max"}), Cells(cell_m, {"max"})
+    tops.add(xyz_m, xyz_m[:, 2])
+    ground.add(xyz_m, xyz_m[:, 2] - above_m)
+    grid = tops.grid()
+    if grid is None:
+        return np.zeros(len(xyz_m), np.bool_)
+    roof = roofs(tops.window(grid, "max"), fill(ground.window(grid, "max")), cell_m)
+    down = np.floor((grid.north_m - xyz_m[:, 1]) / cell_m).astype(np.int64).clip(0, grid.rows - 1)
+    right = np.floor((xyz_m[:, 0] - grid.west_m) / cell_m).astype(np.int64).clip(0, grid.columns - 1)
+    return np.asarray(roof[down, right] & (above_m > _FOOT_M))
 
 
 def _write(aside: Path, ending: str, floor: Floor, made: Made) -> None:

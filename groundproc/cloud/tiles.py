@@ -23,6 +23,8 @@ Array = npt.NDArray[np.float64]
 
 AT_ONCE: Final = 1_000_000
 """Points that a square is to hold, on the average."""
+_WIDEST_M: Final = 1000.0
+"""Rasters of a square follow its side, also where a thin cloud or a corridor fills little of it."""
 _LEAST_HALOS: Final = 8.0
 """Sides of a square in halos, at least: so that not many points lie in several."""
 
@@ -51,7 +53,7 @@ class Tile:
 def side_for(points: int, low_m: Sequence[float], high_m: Sequence[float], halo_m: float) -> float:
     """Side of squares that hold `AT_ONCE` points on the average, of a cloud between two corners [m]."""
     area = max((high_m[0] - low_m[0]) * (high_m[1] - low_m[1]), 1.0)
-    return max(math.sqrt(area * AT_ONCE / max(points, 1)), _LEAST_HALOS * halo_m)
+    return max(min(math.sqrt(area * AT_ONCE / max(points, 1)), _WIDEST_M), _LEAST_HALOS * halo_m)
 
 
 class Tiles:

@@ -25,7 +25,7 @@ how many are on it at least: in a crown some lie on a narrow line by chance. The
 further apart than that; the narrow one tells the four of a rack or a bundle, 25 to 40 cm apart."""
 _FEWEST: Final = 4
 _SPAN_M: Final = 2.0
-_VOXEL_M: Final = 0.2
+VOXEL_M: Final = 0.2
 """Of points nearer to each other one is enough: so dense clouds see as far as thin ones."""
 
 
@@ -57,7 +57,7 @@ def thin_points(xyz_m: Array, core: npt.NDArray[np.bool_]) -> Thin:
     if len(xyz_m) < _FEWEST + 1:
         return Thin(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.bool_))
     origin = np.floor(xyz_m.min(axis=0))
-    voxel, count = assign(xyz_m - origin, _VOXEL_M)
+    voxel, count = assign(xyz_m - origin, VOXEL_M)
     first = np.full(count, -1, np.int64)
     first[voxel[::-1]] = np.arange(len(voxel))[::-1]
     places, core = xyz_m[first] - origin, core[first]

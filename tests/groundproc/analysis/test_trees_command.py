@@ -15,12 +15,16 @@ from simulator import outdoors
 ORIGIN = np.array([533_000.0, 6_472_000.0, 0.0])
 
 
-def listed(folder: Path, xyz: np.ndarray, *words: str) -> list[tuple[np.ndarray, dict[str, Any]]]:
+def listed(
+    folder: Path, xyz: np.ndarray, *words: str, kind: np.ndarray | None = None
+) -> list[tuple[np.ndarray, dict[str, Any]]]:
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = [0.001] * 3, ORIGIN
     header.add_crs(pyproj.CRS.from_epsg(32633))
     las = laspy.LasData(header)
     las.x, las.y, las.z = (xyz + ORIGIN).T
+    if kind is not None:
+        las.classification = kind
     las.write(folder / "c.laz")
     assert (
         main(
@@ -61,6 +65,32 @@ def test_bushes_are_listed_when_asked_for(tmp_path: Path) -> None:
     assert "bush" in kinds
     figures = json.loads((tmp_path / "f.json").read_text())
     assert figures["bushes"] == kinds.count("bush")
+
+
+def test_houses_and_wires_are_no_trees(tmp_path: Path) -> None:
+    """A roof of tiles, a wire aslant, and what another program classed as a building; three trees are left."""
+    rng = np.random.default_rng(4)
+    ground = np.column_stack([rng.uniform(0, 50, (30_000, 2)), np.zeros(30_000)])
+    house = (np.abs(ground[:, 0] - 15) < 5) & (np.abs(ground[:, 1] - 12) < 4)
+    ground[house, 2] = 5.0 + 0.8 * (4 - np.abs(ground[house, 1] - 12)) + rng.normal(0, 0.02, house.sum())
+    along = rng.uniform(0, 1, 700)
+    wire = np.column_stack([50 * along, 20 + 25 * along, 9 + 4 * (along - 0.5) ** 2]) + rng.normal(0, 0.01, (700, 3))
+    trees = [(30.0, 10.0), (40.0, 15.0), (10.0, 40.0)]
+    crowns = [np.array([*at, 6.0]) + 1.5 * sphere(rng, 900) * (1, 1, 1.5) for at in trees]
+    shed = np.column_stack([rng.uniform(30, 33, (900, 1)), rng.uniform(40, 43, (900, 1)), rng.uniform(0, 4, (900, 1))])
+    xyz = np.concatenate([ground, wire, *crowns, shed])
+    kind = np.zeros(len(xyz), np.uint8)
+    kind[-len(shed) :] = 6
+    found = listed(tmp_path, xyz, kind=kind)
+    places = np.array([place[:2] for place, _ in found])
+    assert len(found) == 3
+    assert all(np.hypot(*(places - at).T).min() < 0.5 for at in trees)
+
+
+def sphere(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Points within a ball of radius 1, most of them near its rim."""
+    way = rng.normal(size=(count, 3))
+    return np.asarray(way / np.linalg.norm(way, axis=1)[:, None] * rng.uniform(0.6, 1, (count, 1)))
 
 
 def test_bare_ground_has_no_trees_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

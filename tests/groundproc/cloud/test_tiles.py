@@ -32,3 +32,8 @@ def test_squares_hold_so_many_points_and_are_never_small_beside_the_halo() -> No
     side = side_for(10 * AT_ONCE, (0.0, 0.0), (1000.0, 1000.0), 2.0)
     assert np.isclose(side**2 / 1000.0**2 * 10 * AT_ONCE, AT_ONCE)
     assert side_for(10**9, (0.0, 0.0), (10.0, 10.0), 2.0) >= 16.0
+
+
+def test_squares_of_a_thin_corridor_are_not_all_of_it() -> None:
+    """What makes rasters of a square would fill the bounds of 40 km."""
+    assert side_for(200_000, (0.0, 0.0), (33_000.0, 23_000.0), 10.0) == 1000.0
