@@ -51,7 +51,7 @@ class Grid(Window):
             raise UsageError(
                 f"a raster of {self.columns} x {self.rows} cells of {self.cell_m:g} m found, expected at most {LARGEST_RASTER:,}, "
                 f"and {LONGEST_SIDE:,} a side; "
-                "choose larger cells, or take out the points that lie far from the others"
+                "choose larger cells, or take out the points that lie far from the others: `swath export` with --area"
             )
 
     @classmethod

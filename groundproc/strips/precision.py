@@ -74,7 +74,7 @@ def of_cloud(path: Path, voxel_m: float | None, progress: Progress) -> Precision
     """
     cloud = reader.look(path, SURFACES)
     if not metres_of(cloud).plain:
-        raise GeodesyError(f"{path}: is not in metres; expected a CRS that is")
+        raise GeodesyError(f"{path}: is not in metres; expected a CRS that is: `swath transform` makes it")
     cells, lines = np.empty(0, np.int64), np.empty(0, np.int64)
     for chunk in reader.chunks(cloud, columns=(_LINE,)):
         lines = np.union1d(lines, np.asarray(chunk.points[_LINE], np.int64))
