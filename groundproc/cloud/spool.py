@@ -2,6 +2,7 @@
 
 import tempfile
 import weakref
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +12,7 @@ import numpy.typing as npt
 import zstandard
 from numba import njit
 
+from groundproc.machine.system import give_back_disk
 from groundproc.numerics.voxelhash import sorted_by
 
 Records = npt.NDArray[np.void]
@@ -41,7 +43,7 @@ class Spool:
         self._unpack = zstandard.ZstdDecompressor()
         self._waiting: dict[Place, list[Records]] = {}
         self._bytes = 0
-        self._pieces: dict[Place, list[tuple[int, int]]] = {}
+        self._pieces: dict[Place, array[int]] = {}
         self.counts: dict[Place, int] = {}
         """Records of each square."""
 
@@ -63,22 +65,36 @@ class Spool:
 
     def take(self, place: Place) -> Records:
         """All records of a square, in the order in which they came; they are here no longer."""
-        found = list(self.pieces(place))
-        return _joined(found) if found else np.empty(0, self._dtype)
+        out, done = np.empty(self.counts.get(place, 0), self._dtype), 0
+        for piece in self.pieces(place):
+            _bytes_of(out)[done : done + len(piece)] = _bytes_of(piece)
+            done += len(piece)
+        return out
+
+    def look(self, place: Place) -> Iterator[Records]:
+        """All records of a square, piece by piece, in the order in which they came; they stay, and are not to be changed."""
+        for begin, size in _pairs(self._pieces.get(place)):
+            yield self._read(begin, size)
+        yield from self._waiting.get(place, ())
 
     def pieces(self, place: Place) -> Iterator[Records]:
-        """All records of a square, piece by piece, in the order in which they came; they are here no longer."""
-        for begin, size in self._pieces.pop(place, ()):
-            self._file.seek(begin)
-            ranks = np.frombuffer(self._unpack.decompress(self._file.read(size)), np.uint8)
-            ranks = ranks.reshape(self._dtype.itemsize, -1)
-            records = np.empty(ranks.shape[1], self._dtype)
-            _by_record(ranks, _bytes_of(records))
-            yield records
+        """The same; they are here no longer."""
+        for begin, size in _pairs(self._pieces.pop(place, None)):
+            yield self._read(begin, size)
+            give_back_disk(self._file.fileno(), begin, size)
         waiting = self._waiting.pop(place, [])
         self._bytes -= sum(each.nbytes for each in waiting)
         self.counts.pop(place, None)
         yield from waiting
+
+    def _read(self, begin: int, size: int) -> Records:
+        """A piece from the disk."""
+        self._file.seek(begin)
+        ranks = np.frombuffer(self._unpack.decompress(self._file.read(size)), np.uint8)
+        ranks = ranks.reshape(self._dtype.itemsize, -1)
+        records = np.empty(ranks.shape[1], self._dtype)
+        _by_record(ranks, _bytes_of(records))
+        return records
 
     def _write(self) -> None:
         """Write what waits; squares with few records wait on, unless that is all there is."""
@@ -95,7 +111,7 @@ class Spool:
             self._bytes -= ranks.nbytes
             packed = self._pack.compress(ranks.data)
             self._file.write(packed)
-            self._pieces.setdefault(place, []).append((at, len(packed)))
+            self._pieces.setdefault(place, array("q")).extend((at, len(packed)))
             at += len(packed)
         if many and self._bytes > _WAITING_BYTES // 2:  # very many squares with few records each
             self._write()
@@ -103,9 +119,15 @@ class Spool:
         self._waiting = {place: [_copied(parts)] for place, parts in self._waiting.items()}
 
 
-def _joined(parts: list[Records]) -> Records:
+def joined(parts: list[Records]) -> Records:
     """Records one after the other."""
     return parts[0] if len(parts) == 1 else _copied(parts)
+
+
+def _pairs(numbers: "array[int] | None") -> Iterator[tuple[int, int]]:
+    """Where the pieces of a square begin, and their sizes [bytes]."""
+    numbers = numbers or array("q")
+    return zip(numbers[::2], numbers[1::2], strict=True)
 
 
 def _copied(parts: list[Records]) -> Records:

@@ -15,6 +15,8 @@ THREADS: Final = "NUMBA_NUM_THREADS"
 """The variable of the environment that says how many threads kernels may take; ours follow it."""
 LIMITED: Final = os.name == "posix" and importlib.util.find_spec("resource") is not None
 """Whether a process can be started that has limits and shares memory by a descriptor."""
+_PUNCH_HOLE_KEEP_SIZE: Final = 3
+"""Of Linux' fallocate."""
 _QUERY: Final = 0x1000
 _STILL_ACTIVE: Final = 259
 """Of Windows: PROCESS_QUERY_LIMITED_INFORMATION, and the exit code of what runs."""
@@ -37,6 +39,16 @@ def give_back_memory() -> None:
     """Give what is free to the system, where the C library keeps it: it takes glibc 10 ms, and is 100 MB and more after many threads."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # other C libraries, and none by that way
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def give_back_disk(file: int, begin: int, size: int) -> None:
+    """Give the room of bytes that are needed no more to the system, where it can make a hole in a file (Linux); they are read as 0 then."""
+    with contextlib.suppress(
+        OSError, AttributeError, TypeError
+    ):  # other systems, and C libraries that are found in no such way
+        punch = ctypes.CDLL(None).fallocate
+        punch.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
+        punch(file, _PUNCH_HOLE_KEEP_SIZE, begin, size)
 
 
 def choose_threads_of_blas() -> None:
