@@ -5,6 +5,7 @@ A plane of a voxel has an offset and two tilts. For given poses the best plane i
 remains couples all clusters of the voxel, however far apart in time; it is never written down, only applied to vectors.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -26,6 +27,8 @@ HUBER: Final = 2.0
 """Sigmas beyond which a residual loses weight."""
 CUT: Final = 5.0
 """Sigmas beyond which a cluster is none of this plane: moving things, mixed echoes."""
+PIECE: Final = 1 << 17
+"""Rows that are made or changed at a time, about, where what it takes is larger than they are."""
 PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
 _NOTHING: Final = np.empty(0)
@@ -86,7 +89,25 @@ class PlaneRows:
             self.first, self.knot, self.weights, self.jacobian, self.plane, self.weight, self.residual_m, self.inverse
         )
 
-    def lay(self, kept: Ints, placed: Placed, planes: VoxelPlanes, voxel_m: float) -> None:
+    def pieces(self) -> Iterator[tuple[slice, slice]]:
+        """The voxels some at a time, with their rows: about `PIECE` rows, or one voxel where that has more."""
+        voxels, begin = len(self.first) - 1, 0
+        while begin < voxels:
+            end = max(int(np.searchsorted(self.first, self.first[begin] + PIECE, side="right")) - 1, begin + 1)
+            yield slice(begin, end), slice(int(self.first[begin]), int(self.first[end]))
+            begin = end
+
+    def some(self, piece: tuple[slice, slice]) -> RowArrays:
+        """What the kernels take of some voxels and their rows."""
+        of, part = piece
+        return RowArrays(
+            self.first[of.start : of.stop + 1] - part.start, self.knot[part], self.weights[part], self.jacobian[part], self.plane[part],
+            self.weight[part], self.residual_m[part], self.inverse[of],
+        )  # fmt: skip
+
+    def lay(
+        self, kept: Ints, placed: Placed, planes: VoxelPlanes, voxel_m: float, piece: tuple[slice, slice] | None = None
+    ) -> None:
         """Set distances from the planes and places along them.
 
         Parameters
@@ -98,8 +119,10 @@ class PlaneRows:
         planes : VoxelPlanes
             Of the voxels that the rows have.
         voxel_m : float
+        piece : (slice, slice), optional
+            One of `pieces`: all of this is of its rows and voxels alone.
         """
-        _lay(self.arrays, kept, placed.world_m, planes, voxel_m)
+        _lay(self.arrays if piece is None else self.some(piece), kept, placed.world_m, planes, voxel_m)
 
     def weigh(self, variance_m2: Array, roughness_m: float, cut: bool, voxel_m: float) -> None:
         """Set weights, and the planes that they make.

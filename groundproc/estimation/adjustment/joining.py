@@ -28,7 +28,7 @@ from groundproc.estimation.adjustment.posterior import Posterior, Spread
 from groundproc.estimation.adjustment.solve import problem
 from groundproc.estimation.observations.lidar import DEFLATION
 from groundproc.estimation.observations.observation import Observation, State
-from groundproc.estimation.observations.planes import Rows, placed, rows_of
+from groundproc.estimation.observations.planes import Rows, places, rows_of
 from groundproc.estimation.observations.rows import Factor, H, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
@@ -298,7 +298,7 @@ def padded(path: Path) -> Path:
 
 def shared(patches: Patches, path: Path, voxel_m: float) -> npt.NDArray[np.bool_]:
     """Which patches lie in a voxel that more than one window saw: of the others the windows have said all there is."""
-    world, _ = placed(patches.clusters, path)
+    world = places(patches.clusters, path)
     keys = np.ascontiguousarray(np.floor(world / voxel_m).astype(np.int32))
     _, voxel = np.unique(keys.view([("", np.int32)] * 3).ravel(), return_inverse=True)
     voxels = int(voxel.max()) + 1 if len(voxel) else 0

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from flightlog import frames
-from groundproc.estimation.observations.planes import placed
+from groundproc.estimation.observations.planes import places
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.laying import Flags, Laid, Target
 from groundproc.estimation.odometry.odometry import Odometry
@@ -106,7 +106,7 @@ class _Pieces:
         if number not in self._made:
             begin = self._first + number * PIECE
             planes = PlaneMap(self._track.voxel_m)
-            world, _ = placed(self._track.gathered(begin, begin + PIECE), self._path)
+            world = places(self._track.gathered(begin, begin + PIECE), self._path)
             at = 0
             for clusters in self._track.clusters[begin : begin + PIECE]:
                 if len(clusters):

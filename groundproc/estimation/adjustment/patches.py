@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.estimation.observations.planes import placed
+from groundproc.estimation.observations.planes import placed, places
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
@@ -91,7 +91,7 @@ def coarse(path: Path) -> Path:
 
 def patches_of(gathered: Clusters, path: Path, window: int) -> Patches:
     """Patches of a window's clusters where its path places them."""
-    world, _ = placed(gathered, path)
+    world = places(gathered, path)
     chunk = (gathered.time_ns - path.start_ns) // (SLICE_NS * CHUNK)
     edges = np.searchsorted(chunk, np.arange(chunk[-1] + 2)) if len(chunk) else np.zeros(1, np.int64)
     parts = [_merged(gathered, world, slice(int(first), int(last))) for first, last in pairwise(edges) if last > first]

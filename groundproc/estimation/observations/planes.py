@@ -143,43 +143,74 @@ def rows_of(
     doubted : ndarray of bool, shape (intervals,), optional
         As of `keep_told`.
     """
-    world, rotation, knot, weights = _place_all(clusters, path)
+    world, _, knot, _ = _place_all(clusters, path, turns=False)
     voxel, voxels = assign(world, voxel_m)
     order, first = sorted_by(voxel, voxels)
+    del voxel
     seen = Placed(world, clusters.scatter_m2, clusters.count, knot, np.empty(0, np.int32))
     planes = VoxelPlanes.empty(voxels)
     find_planes(first, order, seen, voxel_m, planes)
     keep = _choose(first, order, knot, planes, path.intervals, most)
-    kept = order[keep]
-    good = np.repeat(np.arange(voxels), np.diff(first))[keep]
-    ids, at = np.unique(good, return_index=True)
     leaves = filled_rows(first, order, seen, voxel_m, planes.good, path.intervals, filled)
-    flat = len(kept)
-    kept = np.concatenate([kept, leaves.cluster])
+    flat = len(keep)
+    kept = np.concatenate([order[keep], leaves.cluster])
+    good = np.repeat(np.arange(voxels, dtype=np.int32), np.diff(first))[keep]
+    at = np.flatnonzero(np.diff(good, prepend=np.int32(-1)))
     starts = np.concatenate([at, flat + leaves.first]).astype(np.int64)
-    n = len(kept)
+    normals = np.concatenate([planes.normal[good[at]], leaves.axis])
+    means = np.concatenate([planes.mean_m[good[at]], leaves.mean_m])
+    n, knots, of_leaves = len(kept), knot[kept], leaves.variance_m2
+    # a window has millions of clusters: what all of them have goes before the rows come, and rows are made some at a time
+    del world, knot, order, good, keep, seen, planes, leaves
     rows = Rows(
-        starts, knot[kept], weights[kept], np.empty((n, 6), np.float32), np.empty((n, 2), np.float32), np.empty(n), np.empty(n),
+        starts, knots, np.empty((n, 4), np.float32), np.empty((n, 6), np.float32), np.empty((n, 2), np.float32), np.empty(n), np.empty(n),
         np.empty((len(starts) - 1, 6)), kept, path.intervals,
     )  # fmt: skip
-    normals, variance = np.concatenate([planes.normal[ids], leaves.axis]), np.empty(n)
-    poses = Poses(rotation, clusters.xyz_m)
-    means = np.concatenate([planes.mean_m[ids], leaves.mean_m])
-    rows.lay(kept, seen, VoxelPlanes(normals, means, np.ones(len(means), np.bool_)), voxel_m)
-    _linearise(rows.arrays, kept, seen, poses, normals, variance)
-    rows.plane[flat:], variance[flat:] = 0.0, leaves.variance_m2  # they have no tilts
+    variance = np.empty(n)
+    for some in rows.pieces():
+        _fill(rows, some, clusters, path, (normals, means), variance, voxel_m)
+    rows.plane[flat:], variance[flat:] = 0.0, of_leaves  # they have no tilts
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
-    rotation, xyz = rotation[kept], clusters.xyz_m[kept]
-    del world, knot, weights, voxel, order, good, keep, seen, poses, variance, leaves  # a hundred bytes a cluster
-    keep_told(rows, Poses(rotation, xyz), flat, voxel_m, means, doubted)
+    del variance, of_leaves
+
+    def poses(part: slice) -> Poses:
+        some = _of(clusters, kept[part])
+        return Poses(_place_all(some, path).rotation, some.xyz_m)
+
+    keep_told(rows, poses, flat, voxel_m, means, doubted)
     if clusters.laser is not None:
-        in_sensor = np.einsum("nji,nj->ni", rotation.reshape(-1, 3, 3), np.repeat(normals, np.diff(starts), axis=0))
-        rows.with_lasers(clusters.laser[kept], xyz, in_sensor)
+        in_sensor = np.empty((n, 3))
+        for of, part in rows.pieces():
+            facing = np.repeat(normals[of], np.diff(starts)[of], axis=0)
+            in_sensor[part] = np.einsum("nji,nj->ni", poses(part).rotation.reshape(-1, 3, 3), facing)
+        rows.with_lasers(clusters.laser[kept], clusters.xyz_m[kept], in_sensor)
     if turning is not None:
         rows.with_retiming(turning, clusters.time_ns[kept], path)
     if spin:
-        rows.with_spin(xyz)
+        rows.with_spin(clusters.xyz_m[kept])
     return rows
+
+
+def _fill(
+    rows: Rows, some: tuple[slice, slice], clusters: Clusters, path: Path, voxels: tuple[Array, Array], variance: Array, voxel_m: float
+) -> None:  # fmt: skip
+    """Fill in some rows, those of some voxels: weights of the spline, jacobians, distances, and variances by the returns.
+
+    `voxels` are the normals and the places of all.
+    """
+    of_voxels, part = some
+    normals, means = (each[of_voxels] for each in voxels)
+    few, none = _of(clusters, rows.cluster[part]), np.empty(0, np.int32)
+    world, rotation, _, weights = _place_all(few, path)
+    rows.weights[part] = weights
+    seen = Placed(world, few.scatter_m2, few.count, none, none)
+    rows.lay(np.arange(len(world)), seen, VoxelPlanes(normals, means, np.ones(len(means), np.bool_)), voxel_m, some)
+    _linearise(rows.some(some), seen, Poses(rotation, few.xyz_m), normals, variance[part])
+
+
+def _of(clusters: Clusters, which: Ints) -> Clusters:
+    """Some clusters, by their numbers; without their lasers."""
+    return Clusters(clusters.time_ns[which], clusters.xyz_m[which], clusters.scatter_m2[which], clusters.count[which])
 
 
 def placed(clusters: Clusters, path: Path) -> tuple[Array, Singles]:
@@ -188,8 +219,13 @@ def placed(clusters: Clusters, path: Path) -> tuple[Array, Singles]:
     return world, rotation
 
 
+def places(clusters: Clusters, path: Path) -> Array:
+    """The first of these, in less memory."""
+    return _place_all(clusters, path, turns=False).world_m
+
+
 class _Located(NamedTuple):
-    """Where a path places clusters.
+    """Where a path places clusters; what nobody asks for has no rows.
 
     Attributes
     ----------
@@ -206,10 +242,12 @@ class _Located(NamedTuple):
     weights: Singles
 
 
-def _place_all(clusters: Clusters, path: Path) -> _Located:
+def _place_all(clusters: Clusters, path: Path, turns: bool = True) -> _Located:
+    """`turns`: with rotations and weights, two thirds of all."""
     count = len(clusters)
+    turned = count if turns else 0
     out = _Located(
-        np.empty((count, 3)), np.empty((count, 9), np.float32), np.empty(count, np.int32), np.empty((count, 4), np.float32)
+        np.empty((count, 3)), np.empty((turned, 9), np.float32), np.empty(count, np.int32), np.empty((turned, 4), np.float32)
     )  # fmt: skip
     _place(clusters.time_ns, clusters.xyz_m, path.arrays, out)
     return out
@@ -222,6 +260,7 @@ def _place(time_ns: Ints, xyz: Singles, path: PathArrays, out: _Located) -> None
     m, a, b = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     last = len(quat) - 2
     intervals = (len(quat) - 1) // STEPS
+    turns = len(rotation) > 0
     for n in range(len(time_ns)):
         g = (time_ns[n] - path.start_ns) / path.step_ns
         i = min(max(int(g), 0), last)
@@ -231,14 +270,17 @@ def _place(time_ns: Ints, xyz: Singles, path: PathArrays, out: _Located) -> None
         for r in range(3):
             for c in range(3):
                 m[r, c] = a[r, c] + u * (b[r, c] - a[r, c])
-                rotation[n, 3 * r + c] = m[r, c]
             world[n, r] = position[i, r] + u * (position[i + 1, r] - position[i, r])
         for r in range(3):
             world[n, r] += m[r, 0] * xyz[n, 0] + m[r, 1] * xyz[n, 1] + m[r, 2] * xyz[n, 2]
         k = min(max(int(g / STEPS), 0), intervals - 1)
         knot[n] = k
-        w0, w1, w2, w3 = basis(g / STEPS - k)
-        weights[n, 0], weights[n, 1], weights[n, 2], weights[n, 3] = w0, w1, w2, w3
+        if turns:
+            for r in range(3):
+                for c in range(3):
+                    rotation[n, 3 * r + c] = m[r, c]
+            w0, w1, w2, w3 = basis(g / STEPS - k)
+            weights[n, 0], weights[n, 1], weights[n, 2], weights[n, 3] = w0, w1, w2, w3
 
 
 @njit(cache=True, nogil=True)
@@ -300,24 +342,23 @@ def _choose(first: Ints, order: Ints, knot: Knots, planes: VoxelPlanes, interval
 
 
 @njit(cache=True, nogil=True)
-def _linearise(rows: RowArrays, kept: Ints, seen: Placed, poses: Poses, normals: Array, variance: Array) -> None:
+def _linearise(rows: RowArrays, seen: Placed, poses: Poses, normals: Array, variance: Array) -> None:
     """Fill in jacobians of rows, and the variance of each by its returns [m^2].
 
-    `kept` has the cluster of each row, `normals` are those of the voxels that the rows have.
+    `seen` and `poses` are the clusters of the rows, `normals` those of the voxels that they lie in.
     """
     first, jacobian = rows.first, rows.jacobian
     scatter, counts, rotation, xyz = seen.scatter_m2, seen.returns, poses.rotation, poses.xyz_m
     for v in range(len(first) - 1):
         nx, ny, nz = normals[v]
         for i in range(first[v], first[v + 1]):
-            n = kept[i]
-            r = rotation[n]
+            r = rotation[i]
             p = nx * r[0] + ny * r[3] + nz * r[6]
             q = nx * r[1] + ny * r[4] + nz * r[7]
             s = nx * r[2] + ny * r[5] + nz * r[8]
-            x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
+            x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
             jacobian[i, 0], jacobian[i, 1], jacobian[i, 2] = y * s - z * q, z * p - x * s, x * q - y * p
             jacobian[i, 3], jacobian[i, 4], jacobian[i, 5] = nx, ny, nz
             # returns of one cluster spread across the plane more than their noise: two surfaces, or an edge
-            across = scatter_along(scatter[n], nx, ny, nz) / counts[n]
-            variance[i] = max(RANGE_SIGMA_M**2, across) / counts[n]
+            across = scatter_along(scatter[i], nx, ny, nz) / counts[i]
+            variance[i] = max(RANGE_SIGMA_M**2, across) / counts[i]

@@ -6,6 +6,7 @@ no more than everything else, direction by direction. A direction that nothing o
 fixes. The rows are changed accordingly.
 """
 
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -50,7 +51,7 @@ class Poses(NamedTuple):
 
 
 def keep_told(
-    rows: PlaneRows, poses: Poses, flat: int, voxel_m: float, place_m: Array, doubted: Mask | None = None
+    rows: PlaneRows, poses: Callable[[slice], Poses], flat: int, voxel_m: float, place_m: Array, doubted: Mask | None = None
 ) -> None:  # fmt: skip
     """Leave in the rows of each interval what they really observe.
 
@@ -63,8 +64,8 @@ def keep_told(
     Parameters
     ----------
     rows : PlaneRows
-    poses : Poses
-        Of the rows' clusters.
+    poses : callable
+        Those of the clusters of some rows: all at once would be more than the rows.
     flat : int
         So many rows are of planes, those after them of what fills its voxel.
     voxel_m : float
@@ -74,19 +75,20 @@ def keep_told(
         Where, as the odometry has it, one direction of the way is not told for long. What seems to tell it there is believed only where it
         does so firmly (`SURE_HELD_M`), and the direction is that of the seconds around.
     """
-    normals, level = np.zeros((rows.intervals, 3)), np.empty_like(rows.jacobian)
+    normals = np.zeros((rows.intervals, 3))
     _sum_ground(rows.knot[:flat], rows.jacobian, rows.weight, normals)
     normals = uniform_filter1d(normals, GROUND_SLICES, axis=0, mode="constant")
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    relief = np.zeros_like(rows.jacobian[:flat])
-    _level(rows.knot, rows.jacobian, poses, normals, level, relief)
     base, more, judged = np.zeros((3, rows.intervals, 6, 6))
-    _blocks(rows.knot, level, rows.weight, base)
-    _blocks(rows.knot[:flat], relief, rows.weight, more)
-    facing = level.copy()
     normal, unsure = _facing(rows, flat, place_m, voxel_m)
-    _face(rows.arrays, poses, flat, (normal, unsure), facing, judged)
-    _blocks(rows.knot, facing, rows.weight, judged)
+    for piece in rows.pieces():
+        few, (of, part) = rows.some(piece), piece
+        seen = poses(part)
+        level, relief = _parts(few, seen, normals, flat - part.start)
+        _blocks(few.knot, level, few.weight, base)
+        _blocks(few.knot[: len(relief)], relief, few.weight, more)
+        _face(few, seen, len(relief), (normal[of], unsure[of]), level, judged)
+        _blocks(few.knot, level, few.weight, judged)
     size = np.trace(judged[:, 3:, 3:], axis1=1, axis2=2)
     doubted = np.zeros(rows.intervals, np.bool_) if doubted is None else doubted
     least = INFLATION * np.where(doubted, SURE_HELD_M, TELLS_M) ** -2 / np.maximum(size, 1e-12)
@@ -95,13 +97,23 @@ def keep_told(
     affected = np.trace(known, axis1=1, axis2=2) < TOLD
     share = shares_of_relief(base, more)
     share[affected] = 0.0
-    _take(rows.arrays, (known, share), (level, relief), poses.rotation)
+    for piece in rows.pieces():
+        few, seen = rows.some(piece), poses(piece[1])
+        _take(few, (known, share), _parts(few, seen, normals, flat - piece[1].start), seen.rotation)
     blind = affected & (known[:, 2, 2] < 0.5)
     if blind.any():
         weaker = np.ones(rows.intervals)
         weaker[blind] = 1.0 / (1.0 + SHAPE_SIGMA_RAD**2 * np.linalg.eigvalsh(base[blind, :3, :3])[:, 2])
         rows.weight *= weaker[rows.knot]
         rows.replane(voxel_m)
+
+
+def _parts(rows: RowArrays, poses: Poses, normals: Array, flat: int) -> tuple[Singles, Singles]:
+    """What `_level` makes of some rows, of which so many are of planes; the second is of these alone."""
+    level = np.empty_like(rows.jacobian)
+    relief = np.zeros_like(rows.jacobian[: max(flat, 0)])
+    _level(rows.knot, rows.jacobian, poses, normals, level, relief)
+    return level, relief
 
 
 def _steady(known: Array, judged: Array, doubted: Mask) -> None:
