@@ -17,6 +17,7 @@ from groundproc.estimation.observations.rows import Factor, Unknowns, prior_fact
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
 from groundproc.machine.readahead import both
+from groundproc.machine.system import give_back_memory
 
 Array = npt.NDArray[np.float64]
 
@@ -123,6 +124,7 @@ class Batch:
             lambda: self.lidar.rows(self.path, voxel_m, cut),
             lambda: linearised((self.lidar, *self.observations), state, unknowns),
         )
+        give_back_memory()
         linear = problem(rows, factors, unknowns, DEFLATION, self.path)
         x, steps = linear.solve(-linear.gradient, share=0.0 if cut else ROUGH)
         cost, used = rows.cost()

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 from scipy import sparse
 
 from flightlog import frames
@@ -24,7 +25,9 @@ from groundproc.estimation.odometry.spline import Path
 from groundproc.numerics.splines import basis
 
 Array = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
+Numbers = npt.NDArray[np.int32]
 
 LASTING_ROWS: Final = 20
 """Rows on end (of a tenth of a second each) whose errors are taken to go together: what lasts longer is found as a bias or a scale."""
@@ -43,12 +46,12 @@ class Noise:
         What the lidar's information is divided by in the normal matrix.
     off_m : ndarray, shape (rows,)
         Distances from the voxels' mean planes at the solution: they are the errors, with a sign for each patch (wild bootstrap by groups).
-    patch : ndarray of int64, shape (rows,)
+    patch : ndarray of int32, shape (rows,)
         Number of the patch of surface that each row is of.
-    step : ndarray of int64, shape (rows,)
+    step : ndarray of int32, shape (rows,)
         Grid step that each row's cluster lies in.
-    turning : ndarray, shape (rows, 3)
-        Rows by a turn about local axes.
+    mats : ndarray, shape (grid, 3, 3)
+        Local from sensor.
     follow : csr_matrix, shape (grid, grid)
         From a course over the grid to what a spline of the path follows of it.
     walk_rad : float
@@ -64,9 +67,9 @@ class Noise:
     rows: Rows
     deflation: float
     off_m: Array
-    patch: Ints
-    step: Ints
-    turning: Array
+    patch: Numbers
+    step: Numbers
+    mats: Array
     follow: sparse.csr_matrix
     walk_rad: float
     carrier: "Carrier | None"
@@ -92,9 +95,11 @@ class Noise:
         """S times a vector, given in its parts."""
         course = np.cumsum(self.walk_rad * turns.reshape(-1, 3), axis=0)
         followed = self.follow @ course
-        bent = np.einsum("ni,ni->n", self.turning, (course - followed)[self.step])
+        in_body = np.einsum("nji,nj->ni", self.mats, course - followed)
+        errors = np.empty(len(self.off_m))
+        _errors(self.rows.jacobian, in_body, self.step, self.off_m, signs, self.patch, errors)
         right: Array = np.array(self.others.T @ others + self.anchors.T @ anchors, np.float64)
-        right[: self.rows.size] += self.rows.spread(self.off_m * signs[self.patch] + bent) / self.deflation
+        right[: self.rows.size] += self.rows.spread(errors) / self.deflation
         if self.carrier is not None:
             right = right + self.carrier.gradient(followed)
         return np.asarray(right)
@@ -103,13 +108,37 @@ class Noise:
         """S^T times a vector of unknowns: what each of the independent numbers does to the linear function that it stands for."""
         patches, _, _, _ = self.sizes
         by_row = self.rows.seen(vector[: self.rows.size]) / self.deflation
-        signs = np.bincount(self.patch, by_row * self.off_m, patches)
         grid = self.follow.shape[0]
-        moments = np.stack([np.bincount(self.step, by_row * axis, grid) for axis in self.turning.T], axis=1)
+        signs, in_body = np.zeros(patches), np.zeros((grid, 3))
+        _collect(self.rows.jacobian, by_row, self.step, self.off_m, self.patch, in_body, signs)
+        moments = np.einsum("nij,nj->ni", self.mats, in_body)
         followed = 0.0 if self.carrier is None else self.carrier.seen(vector, grid)
         course = moments + self.follow.T @ (followed - moments)
         turns = self.walk_rad * np.cumsum(course[::-1], axis=0)[::-1]
         return np.concatenate([signs, turns.ravel(), self.others @ vector, self.anchors @ vector])
+
+
+@njit(cache=True, nogil=True)
+def _errors(
+    jacobian: Singles, in_body: Array, step: Numbers, off_m: Array, signs: Array, patch: Numbers, out: Array
+) -> None:
+    """Errors of rows: what the gyro turned between the knots, in the body, and what surfaces are not, by the signs of their patches."""
+    for i in range(len(out)):
+        turn = in_body[step[i]]
+        out[i] = off_m[i] * signs[patch[i]] + (
+            jacobian[i, 0] * turn[0] + jacobian[i, 1] * turn[1] + jacobian[i, 2] * turn[2]
+        )
+
+
+@njit(cache=True, nogil=True)
+def _collect(
+    jacobian: Singles, by_row: Array, step: Numbers, off_m: Array, patch: Numbers, in_body: Array, signs: Array
+) -> None:
+    """The transpose of it, added up."""
+    for i in range(len(by_row)):
+        signs[patch[i]] += by_row[i] * off_m[i]
+        for c in range(3):
+            in_body[step[i], c] += by_row[i] * jacobian[i, c]
 
 
 @dataclass(slots=True)
@@ -150,9 +179,9 @@ def noise_of(
     rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array
 ) -> Noise:
     """The sources of errors about a solution `x` of a problem that is linear about `path`; where no gyro carries it, none between knots."""
-    step = np.clip((clusters.time_ns[rows.cluster] - path.start_ns) // path.step_ns, 0, len(path.quat) - 2)
+    step = np.clip((clusters.time_ns - path.start_ns) // path.step_ns, 0, len(path.quat) - 2).astype(np.int32)
+    step = step[rows.cluster]
     mats = frames.mat_from_quat(path.quat)
-    voxel = np.repeat(np.arange(len(rows.first) - 1), np.diff(rows.first))
     inside = step[rows.first[:-1]]
     place = np.einsum("nij,nj->ni", mats[inside], clusters.xyz_m[rows.cluster[rows.first[:-1]]])
     carrier, walk_rad, others, anchors = None, 0.0, [], []
@@ -171,17 +200,17 @@ def noise_of(
             others.append(whitened)
     none = sparse.csr_matrix((0, len(x)))
     return Noise(
-        rows, deflation, rows.residual_m + rows.along(x[: rows.size]), _patches(place + path.position_m[inside])[voxel], step,
-        np.einsum("nij,ni->nj", np.swapaxes(mats, 1, 2)[step], rows.jacobian[:, :3]), followed(path),
+        rows, deflation, rows.residual_m + rows.along(x[: rows.size]),
+        np.repeat(_patches(place + path.position_m[inside]), np.diff(rows.first)), step, mats, followed(path),
         walk_rad, carrier,
         sparse.vstack([none, *others], format="csr"), sparse.vstack([none, *anchors], format="csr"),
     )  # fmt: skip
 
 
-def _patches(place_m: Array) -> Ints:
+def _patches(place_m: Array) -> Numbers:
     """Number of the cube of `PATCH_M` that each place lies in, shape (n,)."""
     cube = np.floor(place_m / PATCH_M).astype(np.int64)
-    return np.asarray(np.unique(cube, axis=0, return_inverse=True)[1]).ravel()
+    return np.asarray(np.unique(cube, axis=0, return_inverse=True)[1], np.int32).ravel()
 
 
 def lasting(whitened: Array) -> float:

@@ -146,7 +146,9 @@ class Posterior:
             if place in whole:  # with what the path's coefficients have of it
                 rights[: common.shape[1], i] = common[int(np.flatnonzero(whole == place)[0])]
         solved = self.problem.solve_all(rights, 0.0, ENOUGH_OF_COLUMNS)
-        seen = np.array([self.noise.seen(column) for column in np.ascontiguousarray(solved.T)])
+        seen = np.empty((len(places), sum(self.noise.sizes)))
+        for i, column in enumerate(np.ascontiguousarray(solved.T)):
+            seen[i] = self.noise.seen(column)
         return np.asarray(seen @ seen.T)
 
     def datum(self) -> Array:

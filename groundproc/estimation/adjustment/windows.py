@@ -31,6 +31,7 @@ from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import LIDAR, Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
+from groundproc.machine.system import give_back_memory
 from groundproc.trajectory.covariance import SIZE
 
 Array = npt.NDArray[np.float64]
@@ -179,6 +180,7 @@ def adjust_window(
         common = slice((first - previous.first) * STEPS, (first - previous.first + OVERLAP) * STEPS, STEPS)
         tie = Tie(previous.path.quat[common], previous.path.position_m[common], _walked(previous, first))
         path = _laid_on(path, tie)
+    give_back_memory()  # what the odometry freed is in pieces that are too small for a window
     loops = closed_loops(path, track, first, last)
     path = loops.path
     mat, lever = sources.mat_ins_lidar, sources.lever_m
@@ -196,26 +198,29 @@ def adjust_window(
         if lidar.spin is not None:
             lidar.spin.read(gyro_readings(observations))
     track.forget(last - OVERLAP if more else last)
+    give_back_memory()
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
     spread = posterior.spread(DRAWS)
     unknowns = batch.unknowns()
     (values, exact), seen = _values(unknowns, posterior, spread, sources.exact), None
+    corrections, datum, solved = None, posterior.datum(), posterior.unknowns
+    if sources.lasers_apart:
+        corrections = lidar.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
+    del posterior  # and all rows with it
+    give_back_memory()
     if before or more:
-        stiffness = stiffness_of(batch.path, posterior.unknowns, spread.whole)
+        stiffness = stiffness_of(batch.path, solved, spread.whole)
         frame = coarse(batch.path)
         kept = {each.name: each.keep(batch.state(), frame) for each in observations}
         seen = Seen(patches_of(lidar.clusters, batch.path, len(before)), stiffness, kept)
         # how the whole lies is asked for when all windows are joined
-        spread = spread.without([posterior.unknowns.names[name] for name in ("world.turn", "world.shift")])
-    errors = _errors(batch.path, posterior.unknowns, spread, mat, lever, motion.rate_density)
-    corrections = None
-    if sources.lasers_apart:
-        corrections = lidar.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
+        spread = spread.without([solved.names[name] for name in ("world.turn", "world.shift")])
+    errors = _errors(batch.path, solved, spread, mat, lever, motion.rate_density)
     return Window(
         first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
         batch.log, exact, corrections, batch.said(), seen, errors.correlation,
-        carried_density(observations, motion.rate_density), posterior.datum(), loops.closed, loops.apart,
+        carried_density(observations, motion.rate_density), datum, loops.closed, loops.apart,
     )  # fmt: skip
 
 
