@@ -28,24 +28,31 @@ def bilinear(values: npt.NDArray[np.float32], grid: Grid, xyz_m: Array) -> npt.N
 
 @njit(cache=True, nogil=True)
 def _bilinear(values: Any, west: float, north: float, cell: float, xyz: Any) -> Any:
-    rows, columns = values.shape
+    frame = west, north, cell, values.shape[0], values.shape[1]
     out = np.empty(len(xyz), np.float32)
     for n in range(len(xyz)):
-        u = min(max((xyz[n, 0] - west) / cell - 0.5, 0.0), columns - 1.0)
-        v = min(max((north - xyz[n, 1]) / cell - 0.5, 0.0), rows - 1.0)
-        j, i = int(u), int(v)
-        j2, i2 = min(j + 1, columns - 1), min(i + 1, rows - 1)
-        fu, fv = u - j, v - i
         total, weight = 0.0, 0.0
-        for a, b, w in (
-            (i, j, (1.0 - fu) * (1.0 - fv)), (i, j2, fu * (1.0 - fv)), (i2, j, (1.0 - fu) * fv), (i2, j2, fu * fv),
-        ):  # fmt: skip
-            value = values[a, b]
+        for row, column, share in around(xyz[n, 0], xyz[n, 1], frame):
+            value = values[row, column]
             if value == value:
-                total += w * value
-                weight += w
+                total += share * value
+                weight += share
         out[n] = total / weight if weight > 0.0 else np.nan
     return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def around(east: float, north: float, frame: Any) -> Any:
+    """Row, column and weight of the four cells around a place; frame: west and north edge, cell [m], rows, columns."""
+    west, top, cell, rows, columns = frame
+    u = min(max((east - west) / cell - 0.5, 0.0), columns - 1.0)
+    v = min(max((top - north) / cell - 0.5, 0.0), rows - 1.0)
+    j, i = int(u), int(v)
+    j2, i2 = min(j + 1, columns - 1), min(i + 1, rows - 1)
+    fu, fv = u - j, v - i
+    return (
+        (i, j, (1.0 - fu) * (1.0 - fv)), (i, j2, fu * (1.0 - fv)), (i2, j, (1.0 - fu) * fv), (i2, j2, fu * fv),
+    )  # fmt: skip
 
 
 def heights_at(raster: geotiff.Raster, xy_m: Array) -> Array:

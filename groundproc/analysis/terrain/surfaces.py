@@ -12,6 +12,7 @@ from numba import njit
 
 from groundproc.numerics.layout import to_read
 from groundproc.raster.grid import Grid, Window
+from groundproc.raster.sampling import around
 
 BLOCK: Final = 1024
 """Cells along the side of a block."""
@@ -116,18 +117,10 @@ class Sheet:
 
 @njit(cache=True, nogil=True)
 def _bilinear(blocks: Any, slot: Any, frame: Any, xyz: Any) -> Any:
-    west, north, cell, rows, columns = frame
     out = np.empty(len(xyz), np.float32)
     for n in range(len(xyz)):
-        u = min(max((xyz[n, 0] - west) / cell - 0.5, 0.0), columns - 1.0)
-        v = min(max((north - xyz[n, 1]) / cell - 0.5, 0.0), rows - 1.0)
-        j, i = int(u), int(v)
-        j2, i2 = min(j + 1, columns - 1), min(i + 1, rows - 1)
-        fu, fv = u - j, v - i
         total, weight = 0.0, 0.0
-        for a, b, w in (
-            (i, j, (1.0 - fu) * (1.0 - fv)), (i, j2, fu * (1.0 - fv)), (i2, j, (1.0 - fu) * fv), (i2, j2, fu * fv),
-        ):  # fmt: skip
+        for a, b, w in around(xyz[n, 0], xyz[n, 1], frame):
             number = slot[a // BLOCK, b // BLOCK]
             if number >= 0:
                 value = blocks[number, a % BLOCK, b % BLOCK]
