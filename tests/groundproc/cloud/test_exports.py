@@ -10,6 +10,8 @@ import pyproj
 import pytest
 
 from groundproc.cli import main
+from groundproc.cloud import reader
+from groundproc.cloud.exports import e57
 
 
 def cloud(path: Path, point_format: int = 6, count: int = 60_000, epsg: int | None = 32633) -> laspy.LasData:
@@ -93,21 +95,31 @@ def test_csv_has_a_header_and_digits_enough(tmp_path: Path) -> None:
     source = cloud(tmp_path / "c.laz", 6, 500)
     main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.csv")])
     rows = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True)
-    np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz, atol=1e-6)
+    np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(rows["classification"], source.classification)
     np.testing.assert_allclose(rows["gps_time"], source.gps_time, atol=1e-9)
 
 
-def test_e57_is_read_by_its_own_library(tmp_path: Path) -> None:
+def test_e57_is_read_by_its_own_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "CHUNK", 1100)
+    monkeypatch.setattr(e57, "_AT_ONCE", 500)
     source = cloud(tmp_path / "c.laz", 7, 3000)
-    main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.e57")])
+    assert main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.e57")]) == 0
     with pye57.E57(str(tmp_path / "c.e57")) as file:
+        assert file.scan_count == 1
         scan = file.read_scan(0, intensity=True, colors=True, ignore_missing_fields=True)
+        header = file.get_header(0)
+        limits = [getattr(header, f"{axis}{end}") for axis in "xyz" for end in ("Minimum", "Maximum")]
+        assert header.point_count == len(source)
         assert "UTM zone 33N" in file.root["coordinateMetadata"].value()
     found = np.stack([scan["cartesianX"], scan["cartesianY"], scan["cartesianZ"]], axis=1)
-    np.testing.assert_allclose(found, source.xyz, atol=1e-6)
+    # to the millimetre, not to a share of a northing of thousands of kilometres
+    np.testing.assert_allclose(found, source.xyz, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(scan["intensity"], source.intensity)
     np.testing.assert_array_equal(scan["colorRed"], np.asarray(source.red) >> 8)
+    np.testing.assert_allclose(
+        limits, np.stack([source.xyz.min(axis=0), source.xyz.max(axis=0)], axis=1).ravel(), rtol=0.0
+    )
 
 
 @pytest.mark.parametrize(
