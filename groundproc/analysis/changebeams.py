@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud.surroundings import find
+from groundproc.cloud.voxels import find
 from groundproc.numerics.voxelhash import spread, voxel_key
 from groundproc.numerics.voxelwalk import begin, next_axis
 

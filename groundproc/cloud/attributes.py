@@ -21,6 +21,7 @@ from groundproc.cloud.beams import Beams
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import Errors, MountErrors
 from groundproc.cloud.surroundings import Surroundings
+from groundproc.machine.system import give_back_memory
 from groundproc.sensors.model import Ranging
 from groundproc.trajectory.trajectory import Trajectory
 
@@ -89,13 +90,13 @@ class Found:
         Points of each class.
     mixed : int
         Points that are echoes of two surfaces.
-    stretches : list of cleaning.Classes
+    stretches : list of cleaning.Stretch
         One for each stretch of flight that was cleaned.
     """
 
     classes: dict[int, int] = field(default_factory=dict)
     mixed: int = 0
-    stretches: list[cleaning.Classes] = field(default_factory=list)
+    stretches: list[cleaning.Stretch] = field(default_factory=list)
 
     def add(self, points: Points) -> None:
         """Count points."""
@@ -149,14 +150,15 @@ def described(stream: Stream, scene: Scene, names: frozenset[str], found: Found 
         around.find_planes()
         classes: cleaning.Classes | None = None
         if "classes" in names:
-            evidence = _looked(around, itertools.islice(along, pieces), scene)
-            classes = cleaning.classify(around, evidence)
-            found.stretches.append(classes)
+            classes = cleaning.classify(around, _looked(around, itertools.islice(along, pieces), scene))
+            found.stretches.append(classes.of_stretch)
+        around.keep_planes_only()
+        give_back_memory()  # while points are handed on, the products take the most
         for points in itertools.islice(behind, pieces):
             points = _with_attributes(points, scene, names, _Known(around, classes))
             found.add(points)
             yield points
-        del around  # the next stretch takes its memory
+        del around, classes  # the next stretch takes their memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +169,8 @@ class _Known:
     classes: cleaning.Classes | None
 
 
-def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Evidence:
-    """What the beams of a stretch passed through."""
+def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Looks:
+    """What the beams of a stretch passed through, as `freespace.Evidence` has it."""
     lookout = freespace.Lookout(around)
     for points in pieces:
         if len(points):
@@ -176,7 +178,7 @@ def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> fre
             voxel = around.of(points.xyz_m)
             slant = around.incidence_deg(points.xyz_m, origins, voxel)
             lookout.look_along(points.xyz_m, origins, points.time_ns, slant, voxel)
-    return lookout.evidence
+    return lookout.evidence.open_looks
 
 
 def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, int]:
@@ -214,7 +216,7 @@ def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known:
             columns["classification"] = known.classes.of_voxel[voxel]
             columns["mixed"] = (
                 cleaning.mixed(known.around, points.xyz_m, origins, voxel)
-                if known.classes.trusted
+                if known.classes.of_stretch.trusted
                 else np.zeros(len(points), np.uint8)
             )
     if "sigma" in names:

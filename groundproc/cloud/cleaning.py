@@ -15,8 +15,9 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.cloud.classes import HIGH_NOISE, LOW_NOISE, MOVING, UNCLASSIFIED
-from groundproc.cloud.freespace import AFTER, BEFORE, BETWEEN, SAME, Evidence
-from groundproc.cloud.surroundings import Surroundings, Voxels, beside, find, has_plane, middle_of, off_plane
+from groundproc.cloud.freespace import AFTER, BEFORE, BETWEEN, SAME, Looks
+from groundproc.cloud.surroundings import Surroundings, has_plane, off_plane
+from groundproc.cloud.voxels import Voxels, beside, find, middle_of
 from groundproc.numerics.voxelhash import voxel_key
 
 Array = npt.NDArray[np.float64]
@@ -67,48 +68,53 @@ OFF_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Classes:
+class Stretch:
     """What cleaning says of a stretch of flight.
 
     Attributes
     ----------
-    of_voxel : ndarray of uint8, shape (used,)
     contradicted : float
         Share of the voxels that beams passed through.
     trusted : bool
         Whether that is so little that things moved; else the path did, and what beams passed through tells nothing.
     """
 
-    of_voxel: Bytes
     contradicted: float
     trusted: bool
 
 
-def classify(around: Surroundings, evidence: Evidence) -> Classes:
-    """Class of each voxel."""
-    classes = np.full(around.used, UNCLASSIFIED, np.uint8)
-    moving, looks = np.zeros(around.used, np.uint8), evidence.open_looks.copy()
+@dataclass(frozen=True, slots=True)
+class Classes:
+    """What cleaning says of the voxels of a stretch of flight: ndarray of uint8, shape (used,); and of the stretch."""
+
+    of_voxel: Bytes
+    of_stretch: Stretch
+
+
+def classify(around: Surroundings, looks: Looks) -> Classes:
+    """Class of each voxel by what beams passed through, as `Evidence` has it; that is written over."""
+    classes, moving = np.full(around.used, UNCLASSIFIED, np.uint8), np.zeros(around.used, np.uint8)
     for level in _SURFACES:
-        cubes = around.levels[level]
-        _spare(around.voxels, around.edge_m, around.parents[level - 1], cubes.voxels, cubes.edge_m, looks)
+        cubes, parent = around.levels[level]
+        _spare(around.voxels, around.edge_m, parent, cubes.voxels, cubes.edge_m, looks)
     seeds, stayed = _begin(around.table, around.voxels, looks, moving)
     share = seeds / max(around.used, 1)
     points = int(around.voxels.many[: around.used].sum())
     trusted = bool(share <= MOST_CONTRADICTED and stayed <= MOST_STAYED * points)
     if not trusted:
-        looks, moving = np.zeros_like(looks), np.zeros_like(moving)
-    metre, four = around.levels[_METRE], around.levels[_FOUR_METRES]
+        looks[:], moving[:] = 0, 0
+    (metre, in_metre), (four, in_four) = around.levels[_METRE], around.levels[_FOUR_METRES]
     crowd = np.zeros(metre.used, np.int32)
     _crowds(metre.table, metre.voxels, metre.used, crowd)
-    _noise(around.table, around.voxels, looks, crowd[around.parents[_METRE - 1]], classes)
-    _heights(around.parents[_FOUR_METRES - 1], four.table, four.voxels, classes)
+    _noise(around.table, around.voxels, looks, crowd[in_metre], classes)
+    _heights(in_four, four.table, four.voxels, classes)
     while _grow(around.table, around.voxels, looks, moving, False):
         pass
     moving[moving > 0] = _EDGE
     for _ in range(ROUNDS):
         _grow(around.table, around.voxels, looks, moving, True)
     classes[moving > 0] = MOVING
-    return Classes(classes, share, trusted)
+    return Classes(classes, Stretch(share, trusted))
 
 
 def mixed(around: Surroundings, xyz_m: Array, origins_m: Array, voxel: Ints) -> Bytes:

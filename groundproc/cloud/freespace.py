@@ -20,13 +20,15 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud.surroundings import LOOK_MS, Surroundings, Voxels, find, middle_of, signed
+from groundproc.cloud.surroundings import LOOK_MS, Surroundings
+from groundproc.cloud.voxels import Voxels, find, middle_of, signed
 from groundproc.machine.system import cores
 from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 Ints = npt.NDArray[np.int32]
+Looks = npt.NDArray[np.int16]
 
 EVERY: Final = 5
 """Of so many shots one is looked along; no multiple of the lasers, so that each has its turn."""
@@ -45,6 +47,8 @@ _MOST_THREADS: Final = 4
 """More would go along the same rays for too little."""
 _FARTHER: Final = 1.05
 
+_MOST_LOOKS: Final = (1 << 15) - 1
+
 BEFORE, BETWEEN, AFTER, SAME = range(4)
 
 
@@ -53,13 +57,14 @@ class Evidence(NamedTuple):
 
     Attributes
     ----------
-    open_looks : ndarray of int32, shape (n, 4)
-        Looks through it before it was first hit, between hits, after it was last hit; and those at which it was hit too.
+    open_looks : ndarray of int16, shape (n, 4)
+        Looks through it before it was first hit, between hits, after it was last hit; and those at which it was hit too. Half an hour of
+        looking without end fills it, and more is not counted.
     last_ms, hit_ms : ndarray of int32, shape (n,)
         Time of the last one, and of the last hit.
     """
 
-    open_looks: Ints
+    open_looks: Looks
     last_ms: Ints
     hit_ms: Ints
 
@@ -67,7 +72,7 @@ class Evidence(NamedTuple):
     def none(cls, size: int) -> "Evidence":
         """No beam yet."""
         never = np.full(size, -(1 << 30), np.int32)
-        return cls(np.zeros((size, 4), np.int32), never, never.copy())
+        return cls(np.zeros((size, 4), np.int16), never, never.copy())
 
 
 class _Maps(NamedTuple):
@@ -119,10 +124,10 @@ class Lookout:
     def __init__(self, around: Surroundings) -> None:
         self._around, self.evidence = around, Evidence.none(around.used)
         self._threads = min(cores(), _MOST_THREADS)
-        cubes = around.levels[_LEVEL]
+        cubes, parent = around.levels[_LEVEL]
         full, cube_part = np.zeros((cubes.used, 8), np.uint64), np.empty(cubes.used, np.uint8)
         part = np.empty(around.used, np.uint8)
-        _share(around.voxels.key, around.parents[_LEVEL - 1], cubes.voxels.key, self._threads, full, cube_part, part)
+        _share(around.voxels.key, parent, cubes.voxels.key, self._threads, full, cube_part, part)
         self._maps = _Maps(
             around.table,
             around.voxels,
@@ -262,10 +267,16 @@ def _through_voxels(ray: Any, between: Any, now_ms: int, maps: _Maps, evidence: 
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _count(looks: Any, v: Any, when: int) -> None:
+    if looks[v, when] < _MOST_LOOKS:
+        looks[v, when] += 1
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _note_hit(evidence: Evidence, v: Any, now_ms: Any) -> None:
     """A hit: if there was a look through the voxel just now, that was of something that hides only a part of it."""
     if now_ms - evidence.hit_ms[v] >= LOOK_MS and now_ms - evidence.last_ms[v] < LOOK_MS:
-        evidence.open_looks[v, SAME] += 1
+        _count(evidence.open_looks, v, SAME)
     evidence.hit_ms[v] = now_ms
 
 
@@ -279,7 +290,7 @@ def _note(voxels: Voxels, evidence: Evidence, v: int, now_ms: int) -> None:
         when = BEFORE
     else:
         when = AFTER if now_ms > last + APART_MS else BETWEEN
-    evidence.open_looks[v, when] += 1
+    _count(evidence.open_looks, v, when)
     evidence.last_ms[v] = now_ms
 
 

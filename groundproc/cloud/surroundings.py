@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from groundproc.cloud.voxels import MASK, VoxelMap, Voxels, beside, find, middle_of, place_of, signed
 from groundproc.numerics.planes import flattest
-from groundproc.numerics.voxelhash import spread, voxel_key
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -22,16 +22,21 @@ Single = npt.NDArray[np.float32]
 EDGE_M: Final = 0.25
 LEVELS: Final = 4
 """Larger voxels: each level has twice the edge of the one before."""
-_ORDER: Final = (2, 1, 0)
-"""Levels that are asked for a plane, in this order, before the neighbours are; the largest are asked last."""
+_FIRST: Final = (2, 1)
+_LAST: Final = (3, 4)
+"""Levels that are asked for a plane, in this order, before the voxel itself and its neighbours are, and after them."""
+_KEPT: Final = (2, 3, 4)
+"""Levels that free space and classes ask for."""
 MOST: Final = 4_000_000
-"""Voxels of a stretch of flight: some 400 MB."""
+"""Voxels of a stretch of flight: some 600 MB."""
+_PIECE: Final = 1 << 19
+"""Room for those of the piece that is one too many; there is more where it takes more."""
+_SOME: Final = 1 << 16
+"""Points, or voxels, between which the table may grow."""
 LOOK_MS: Final = 50
 """Shots of one voxel within so long are one look: they are of one revolution, and err together."""
 MOST_POINTS: Final = 4096
 """Points of a voxel that its moments are made of: a hover adds nothing more."""
-_BEGIN: Final = 1 << 16
-_MASK: Final = 0x1FFFFF
 _FLAT_M: Final = 0.03
 _FLAT_SHARE: Final = 0.03
 """RMS off the plane of what counts as flat: the sensor's noise and that of a path that knows where it is, and so much of the edge."""
@@ -42,48 +47,14 @@ _NEAR_M: Final = 0.05
 """How far off a plane the points of a voxel may lie that it is said of."""
 
 
-class Voxels(NamedTuple):
-    """Voxels in the order in which they were met, as kernels take them; arrays are longer than what is used.
+class Level(NamedTuple):
+    """Voxels of a larger edge, and in which of them each small one is: ndarray of int32, shape (used,)."""
 
-    Attributes
-    ----------
-    key : ndarray of int64, shape (n,)
-    many : ndarray of int32, shape (n,)
-        Points.
-    sums : ndarray of float32, shape (n, 10)
-        How many points the sums are of; sums of x, y, z, xx, xy, xz, yy, yz, zz from the middle of the voxel [m, m^2].
-    when_ms : ndarray of int32, shape (n, 2)
-        First and last time of a point, from the begin of the stretch.
-    looks : ndarray of int32, shape (n,)
-        How often it was hit, what comes within `LOOK_MS` counted once.
-    farthest_m : ndarray of float32, shape (n,)
-        Largest range of a point.
-    seen : ndarray of float32, shape (n, 3)
-        Sum of the directions of the beams that hit it.
-    normal : ndarray of float32, shape (n, 3)
-        Unit vector; zero where there is no plane.
-    """
-
-    key: Times
-    many: Ints
-    sums: Single
-    when_ms: Ints
-    looks: Ints
-    farthest_m: Single
-    seen: Single
-    normal: Single
-
-    @classmethod
-    def empty(cls, size: int) -> "Voxels":
-        """Room for so many."""
-        return cls(
-            np.zeros(size, np.int64), np.zeros(size, np.int32), np.zeros((size, 10), np.float32),
-            np.zeros((size, 2), np.int32), np.zeros(size, np.int32), np.zeros(size, np.float32), np.zeros((size, 3), np.float32),
-            np.zeros((size, 3), np.float32),
-        )  # fmt: skip
+    cubes: VoxelMap
+    parent: Ints
 
 
-class Surroundings:
+class Surroundings(VoxelMap):
     """The voxels of a stretch of flight.
 
     Parameters
@@ -92,23 +63,14 @@ class Surroundings:
 
     Attributes
     ----------
-    voxels : Voxels
-    used : int
-        How many there are.
-    levels : list of Surroundings
-        This and the larger ones, of 2, 4, 8, 16 times the edge, when the planes are found.
-    parents : list of ndarray of int32, shape (used,)
-        In which voxel of each larger level each of these is.
+    levels : dict of int to Level
+        The larger ones that are asked for, by level, when the planes are found: level k has 2^k times the edge.
     """
 
     def __init__(self, edge_m: float = EDGE_M) -> None:
-        self.edge_m = edge_m
-        self.voxels = Voxels.empty(_BEGIN)
-        self.used = 0
-        self.table = np.full(4 * _BEGIN, -1, np.int32)
+        super().__init__(edge_m, MOST + _PIECE)
         self.begin_ns: int | None = None
-        self.levels: list[Surroundings] = []
-        self.parents: list[Ints] = []
+        self.levels: dict[int, Level] = {}
 
     @property
     def full(self) -> bool:
@@ -119,10 +81,13 @@ class Surroundings:
         """Take points, shape (n, 3), with their times and the places of the sensor."""
         if self.begin_ns is None:
             self.begin_ns = int(time_ns[0])
-        self._make_room(len(xyz_m))
-        self.used = int(
-            _add(xyz_m, self.elapsed_ms(time_ns), origins_m, self.edge_m, self.table, self.voxels, self.used)
-        )
+        elapsed_ms = self.elapsed_ms(time_ns)
+        for begin in range(0, len(xyz_m), _SOME):
+            some = slice(begin, begin + _SOME)
+            self.make_room(len(xyz_m[some]))
+            self.used = int(
+                _add(xyz_m[some], elapsed_ms[some], origins_m[some], self.edge_m, self.table, self.voxels, self.used)
+            )
 
     def elapsed_ms(self, time_ns: Times) -> Times:
         """Times since the begin of the stretch."""
@@ -130,37 +95,22 @@ class Surroundings:
 
     def find_planes(self) -> None:
         """Find the plane of each voxel: all points are there."""
-        levels: list[Surroundings] = [self]
-        parents: list[Ints] = []
-        self.levels, self.parents = levels, parents
-        for _ in range(LEVELS):
-            below = levels[-1]
-            larger = Surroundings(2.0 * below.edge_m)
-            larger._make_room(below.used)
-            parent = np.empty(below.used, np.int32)
-            larger.used = int(_join(below.voxels, below.edge_m, larger.table, larger.voxels, parent))
-            levels.append(larger)
-            # of the small voxels, whichever level it is
-            parents.append(parent if not parents else parent[parents[-1]])
-        for level in levels:
-            _planes(level.voxels, level.used, level.edge_m)
+        below, parent = self._larger(self, None)
+        levels = {1: Level(below, parent)}
+        for number in range(2, LEVELS + 1):
+            below, parent = self._larger(below, parent)
+            levels[number] = Level(below, parent)
+        for each in (self, *(level.cubes for level in levels.values())):
+            _planes(each.voxels, each.used, each.edge_m)
         found = np.zeros((self.used, 3), np.float32)
-        own = np.arange(self.used, dtype=np.int32)
-        for number in _ORDER:
-            level = levels[number]
-            _take(
-                self.voxels, self.edge_m, own if number == 0 else parents[number - 1], level.voxels, level.edge_m, found
-            )
+        for number in _FIRST:
+            self._take(levels[number], found)
+        self._take(Level(self, np.arange(self.used, dtype=np.int32)), found)
         self.voxels.normal[: self.used] = found
         _borrow(self.table, self.voxels, self.used, self.edge_m)
-        for parent, level in zip(parents[2:], levels[3:], strict=True):
-            _take(self.voxels, self.edge_m, parent, level.voxels, level.edge_m, self.voxels.normal[: self.used])
-
-    def of(self, xyz_m: Array) -> Ints:
-        """Number of the voxel of each point, shape (n,); -1: of none."""
-        out = np.empty(len(xyz_m), np.int32)
-        _find(xyz_m, self.edge_m, self.table, self.voxels.key, out)
-        return out
+        for number in _LAST:
+            self._take(levels[number], self.voxels.normal[: self.used])
+        self.levels = {number: levels[number] for number in _KEPT}
 
     def incidence_deg(self, xyz_m: Array, origins_m: Array, voxel: Ints) -> Single:
         """Angle between beam and normal of each point, shape (n,); not-a-number without a plane."""
@@ -168,58 +118,26 @@ class Surroundings:
         _incidence(xyz_m, origins_m, voxel, self.voxels.normal, out)
         return out
 
-    def _make_room(self, more: int) -> None:
-        """See that so many more voxels fit."""
-        size = len(self.voxels.key)
-        if self.used + more <= size:
-            return
-        while size < self.used + more:
-            size *= 2
-        grown = Voxels.empty(size)
-        for name, old in self.voxels._asdict().items():
-            getattr(grown, name)[: self.used] = old[: self.used]
-        self.voxels = grown
-        self.table = np.full(4 * size, -1, np.int32)
-        _fill_table(self.voxels.key, self.used, self.table)
+    def keep_planes_only(self) -> None:
+        """Give back what only classes are made of."""
+        self.levels = {}
+        self.voxels = self.voxels.with_planes_only()
 
+    @staticmethod
+    def _larger(below: VoxelMap, parent: Ints | None) -> Level:
+        """The voxels of twice the edge; and in which of them each of the smallest is, by what it is in below them."""
+        larger = VoxelMap(2.0 * below.edge_m, below.used)
+        above = np.empty(below.used, np.int32)
+        for begin in range(0, below.used, _SOME):
+            some = begin, min(begin + _SOME, below.used)
+            larger.make_room(min(some[1] - begin, below.used - larger.used))
+            larger.used = int(_join(below.voxels, below.edge_m, some, larger.table, larger.voxels, larger.used, above))
+        return Level(larger, above if parent is None else above[parent])
 
-@njit(cache=True, nogil=True, inline="always")
-def find(key: Any, table: Any, keys: Any) -> Any:
-    """Number of a voxel by its key; -1 where it is not there."""
-    mask = len(table) - 1
-    slot = spread(key) & mask
-    while table[slot] >= 0 and keys[table[slot]] != key:
-        slot = (slot + 1) & mask
-    return table[slot]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def beside(key: Any, i: int, j: int, k: int) -> Any:
-    """Key of the voxel so many voxels away."""
-    x, y, z = (key >> 42) + i, (key >> 21) + j, key + k
-    return ((x & _MASK) << 42) | ((y & _MASK) << 21) | (z & _MASK)
-
-
-@njit(cache=True, nogil=True)
-def _fill_table(keys: Any, used: int, table: Any) -> None:
-    mask = len(table) - 1
-    for v in range(used):
-        slot = spread(keys[v]) & mask
-        while table[slot] >= 0:
-            slot = (slot + 1) & mask
-        table[slot] = v
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _place_of(key: Any, table: Any, keys: Any, used: int) -> Any:
-    """Number of a voxel, which is the next one where it is new."""
-    mask = len(table) - 1
-    slot = spread(key) & mask
-    while table[slot] >= 0 and keys[table[slot]] != key:
-        slot = (slot + 1) & mask
-    if table[slot] < 0:
-        table[slot], keys[used] = used, key
-    return table[slot]
+    def _take(self, level: Level, normal: Single) -> None:
+        """Give voxels without a plane, in `normal`, shape (used, 3), that of the voxel they are in, if it passes through their points."""
+        cubes = level.cubes
+        _take(self.voxels, self.edge_m, level.parent, cubes.voxels, cubes.edge_m, normal)
 
 
 @njit(cache=True, nogil=True)
@@ -228,8 +146,8 @@ def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels:
     per_m = 1.0 / edge_m
     for n in range(len(xyz)):
         i, j, k = np.floor(xyz[n, 0] * per_m), np.floor(xyz[n, 1] * per_m), np.floor(xyz[n, 2] * per_m)
-        key = ((np.int64(i) & _MASK) << 42) | ((np.int64(j) & _MASK) << 21) | (np.int64(k) & _MASK)
-        v = _place_of(key, table, keys, used)
+        key = ((np.int64(i) & MASK) << 42) | ((np.int64(j) & MASK) << 21) | (np.int64(k) & MASK)
+        v = place_of(key, table, keys, used)
         if v == used:
             used += 1
             when[v, 0], when[v, 1] = time_ms[n], time_ms[n] - LOOK_MS
@@ -278,32 +196,14 @@ def _add_moved(total: Any, s: Any, x: float, y: float, z: float) -> None:
     total[9] += s[9] + 2.0 * z * s[3] + n * z * z
 
 
-@njit(cache=True, nogil=True, inline="always")
-def signed(part: Any) -> Any:
-    """A coordinate of 21 bits as a number."""
-    part = part & _MASK
-    return part - (_MASK + 1) if part > _MASK >> 1 else part
-
-
-@njit(cache=True, nogil=True, inline="always")
-def middle_of(key: Any, edge_m: float) -> Any:
-    """Middle of a voxel: three numbers."""
-    return (
-        (signed(key >> 42) + 0.5) * edge_m,
-        (signed(key >> 21) + 0.5) * edge_m,
-        (signed(key) + 0.5) * edge_m,
-    )
-
-
 @njit(cache=True, nogil=True)
-def _join(voxels: Voxels, edge_m: float, table: Any, larger: Voxels, parent: Any) -> int:
-    """Fill voxels of twice the edge with the sums of small ones, and say which each is in; gives how many there are."""
-    found = 0
-    for v in range(len(parent)):
+def _join(voxels: Voxels, edge_m: float, some: Any, table: Any, larger: Voxels, found: int, parent: Any) -> int:
+    """Add the sums of some small voxels, begin and end, to those of twice the edge, say which each is in; gives how many there are."""
+    for v in range(some[0], some[1]):
         key = voxels.key[v]
         i, j, k = signed(key >> 42) >> 1, signed(key >> 21) >> 1, signed(key) >> 1
-        above = ((i & _MASK) << 42) | ((j & _MASK) << 21) | (k & _MASK)
-        w = _place_of(above, table, larger.key, found)
+        above = ((i & MASK) << 42) | ((j & MASK) << 21) | (k & MASK)
+        w = place_of(above, table, larger.key, found)
         if w == found:
             found += 1
         parent[v] = w
@@ -392,13 +292,6 @@ def _borrow(table: Any, voxels: Voxels, used: int, edge_m: float) -> None:
     for v in range(used):
         if chosen[v] >= 0:
             normal[v] = normal[chosen[v]]
-
-
-@njit(cache=True, nogil=True)
-def _find(xyz: Any, edge_m: float, table: Any, keys: Any, out: Any) -> None:
-    per_m = 1.0 / edge_m
-    for n in range(len(xyz)):
-        out[n] = find(voxel_key(xyz[n, 0], xyz[n, 1], xyz[n, 2], per_m), table, keys)
 
 
 @njit(cache=True, nogil=True)

@@ -50,6 +50,18 @@ class Pool:
         return lent.reshape(shape)
 
 
+def untouched(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Zeros, of which only what is touched takes memory; it is the system's again as soon as the array is gone.
+
+    As `numpy.zeros`, but for what the C library keeps for later: it may hand out what it has cleared, which is touched, and it may keep it.
+    """
+    kind = np.dtype(dtype)
+    count = prod(shape) if isinstance(shape, tuple) else shape
+    if count * kind.itemsize < _LARGE_PAGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.zeros(shape, kind)
+    return np.frombuffer(_fresh(count * kind.itemsize).data, kind, count).reshape(shape)
+
+
 def _fresh(size: int) -> npt.NDArray[np.uint8]:
     """Memory of the system, on large pages where it has some: fewer addresses to look up."""
     if size < _LARGE_PAGE or not hasattr(mmap, "MADV_HUGEPAGE"):

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud.surroundings import find
+from groundproc.cloud.voxels import find
 from groundproc.numerics.voxelhash import assign, sorted_by, spread, voxel_key
 
 Array = npt.NDArray[np.float64]

@@ -1,5 +1,7 @@
 """Planes around points, and the passes over a flight that find them."""
 
+import gc
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -15,6 +17,7 @@ from groundproc.cloud import attributes, surroundings
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import MountErrors
 from groundproc.cloud.surroundings import Surroundings
+from groundproc.cloud.voxels import VoxelMap
 from groundproc.geodesy import LocalFrame
 from groundproc.sensors.model import Ranging
 from groundproc.trajectory.trajectory import Trajectory
@@ -145,6 +148,50 @@ def test_points_come_in_their_order_whatever_the_stretches(monkeypatch: pytest.M
             if len(some):
                 assert set(some.columns) == {"range", *(name for each in attributes.NAMES.values() for name in each)}
                 assert np.isfinite(some["incidence"]).mean() > 0.95
+
+
+def test_one_stretch_at_a_time_is_in_memory_however_long_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but what holds a stretch keeps it: it is gone with its last point, and does not wait for the collector of cycles."""
+    alive: weakref.WeakSet[VoxelMap] = weakref.WeakSet()
+    most: list[int] = []
+
+    begin = VoxelMap.__init__
+
+    def counted(made: VoxelMap, edge_m: float, room: int) -> None:
+        begin(made, edge_m, room)
+        alive.add(made)
+        most.append(sum(each.edge_m == surroundings.EDGE_M for each in alive))
+
+    monkeypatch.setattr(VoxelMap, "__init__", counted)
+    monkeypatch.setattr(surroundings, "MOST", 1500)
+    found = attributes.Found()
+    gc.collect()
+    gc.disable()
+    try:
+        for some in attributes.described(stream, scene(), attributes.wanted(None), found):
+            assert len(some) == 0 or len(alive) == 1  # the larger voxels are gone before points are handed on
+    finally:
+        gc.enable()
+    assert len(most) > 20
+    assert max(most) == 1
+    assert not alive
+    assert len(found.stretches) > 4
+    assert not any(hasattr(each, "of_voxel") for each in found.stretches)
+
+
+def test_a_stretch_takes_as_much_memory_as_it_has_voxels() -> None:
+    made = around(np.random.default_rng(6).uniform(-20, 20, (60_000, 3)))
+    size = surroundings.MOST + 1
+    assert len(made.voxels.key) > size
+    assert 2 * made.used <= len(made.table) <= 8 * made.used
+    for number, (cubes, parent) in made.levels.items():
+        assert len(parent) == made.used
+        assert len(cubes.voxels.key) <= made.used
+        assert len(cubes.table) <= 8 * made.used, number
+    made.keep_planes_only()
+    assert not made.levels
+    held = {name for name, array in made.voxels._asdict().items() if len(array)}
+    assert held == {"key", "sums", "normal"}
 
 
 def test_points_of_a_flight_line_have_its_number() -> None:

@@ -1,10 +1,13 @@
 """Memory is lent again when nobody looks at it any more, and never before."""
 
+import mmap
 import threading
+from pathlib import Path
 
 import numpy as np
+import pytest
 
-from groundproc.numerics.memory import Pool
+from groundproc.numerics.memory import Pool, untouched
 
 MANY = 1 << 20
 
@@ -73,3 +76,18 @@ def test_threads_never_get_the_same_memory() -> None:
     for thread in threads:
         thread.join()
     assert wrong == []
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells there what is resident")
+def test_zeros_take_memory_where_they_are_touched() -> None:
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+    before = resident()
+    made = untouched((1 << 24, 4), np.float32)
+    assert made.shape == (1 << 24, 4)
+    made[: 1 << 20] = 1.0
+    assert not made[1 << 20].any()
+    assert resident() - before < 48 << 20  # of 256 MB
+    del made
+    assert resident() - before < 16 << 20
