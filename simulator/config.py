@@ -49,6 +49,9 @@ class GyroOptions:
     )
     accel_noise_g: float = option(0.015, "white noise of a sample, one sigma [g]", minimum=0, maximum=2)
     accel_rotor_line_g: float = option(0.04, "amplitude at the rotor's frequency [g]", minimum=0, maximum=2)
+    accel_bias_g: float = option(
+        0.0, "constant error of the force along each axis, one sigma over seeds [g]", minimum=0, maximum=2
+    )
     offset_walk_deg_s: float = option(
         0.0, "random walk of the zero offsets, one sigma after a minute [deg/s]", minimum=0, maximum=10
     )

@@ -81,6 +81,9 @@ class Telemetry:
             generator(seed, "telemetry gyro walk"), flight.duration_s, options.gyros.offset_walk_deg_s
         )
         """On top of their zero offsets [deg/s]."""
+        bias = generator(seed, "telemetry accelerometers").standard_normal(3)
+        self.accel_bias_g = options.gyros.accel_bias_g * bias
+        """Of the force, along the axes of the lidar."""
         self._rotor_hz = options.lidar.rpm / 60.0
         rng = generator(seed, "telemetry times")
         count = int(flight.duration_s / 0.004) + 100
@@ -118,7 +121,7 @@ class Telemetry:
         gyros = gyros + np.array(o.rotor_line_deg_s) * np.sin(turn + np.array([0.3, 1.9, 3.1]))
         force = self._flight.specific_force_m_s2(felt_s, self._lever_m) @ self._mat_lidar_ins.T / STANDARD_GRAVITY_M_S2
         # readings are the pull of gravity along the labelled arrow, minus the specific force: X up is -z on chips 1 and 2
-        x, y, z = force.T
+        x, y, z = (force + self.accel_bias_g).T
         accel = np.stack([z, -x, z, -y, x, -y], axis=1)
         accel = accel + o.accel_noise_g * rng.standard_normal(accel.shape)
         # imbalance, seen a quarter turn later by the y axes than by the x axes

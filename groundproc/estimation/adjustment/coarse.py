@@ -129,6 +129,12 @@ class Coarse:
     prolongation: sparse.csr_matrix
     factor: Any
 
+    @property
+    def nodes(self) -> int:
+        """How many there are."""
+        globals_ = self.prolongation.shape[0] - self.rigid.shape[0]
+        return (self.prolongation.shape[1] - globals_) // 6
+
     def solve(self, right: Array) -> Array:
         """The best coarse solution, shape as `right`: (unknowns,) or (unknowns, m)."""
         return np.asarray(self.prolongation @ cho_solve(self.factor, self.prolongation.T @ right, check_finite=False))

@@ -17,6 +17,8 @@ from numba import njit
 from scipy import sparse
 
 from flightlog import frames
+from groundproc.estimation.adjustment.coarse import Coarse
+from groundproc.estimation.adjustment.straining import of_source, strains
 from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.observations.rows import PRIOR, Errors, Factor
 from groundproc.estimation.odometry.clusters import Clusters
@@ -176,9 +178,10 @@ class Carrier:
 
 
 def noise_of(
-    rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array
+    rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array, coarse: Coarse
 ) -> Noise:
     """The sources of errors about a solution `x` of a problem that is linear about `path`; where no gyro carries it, none between knots."""
+    strain = strains(factors, x, coarse)
     step = np.clip((clusters.time_ns - path.start_ns) // path.step_ns, 0, len(path.quat) - 2).astype(np.int32)
     step = step[rows.cluster]
     mats = frames.mat_from_quat(path.quat)
@@ -195,7 +198,7 @@ def noise_of(
         elif factor.name == PRIOR:  # that of the path is no knowledge, only a weak hold
             anchors.append(whitened[6 * (rows.intervals + 3) :])
         elif factor.errors is Errors.ANCHOR:
-            anchors.append(whitened)
+            anchors.append(sparse.diags(of_source(strain, factor)) @ whitened)
         else:
             others.append(whitened)
     none = sparse.csr_matrix((0, len(x)))

@@ -319,13 +319,15 @@ def position_factors(
         clock.add(builder, row, means(velocities(path, step, given.lever_m), group))
     time_s = (time_ns[middle] - time_ns[0]) * 1e-9
     course = whitened("position", residual, builder.matrix(), time_s, sigma, given.tau_s, given.white_m, Errors.ANCHOR)
-    course = replace(course, sigma=course.sigma * np.tile([left.strain, left.strain, 1.0], count))
+    course = replace(
+        course, sigma=course.sigma * np.tile([left.strain, left.strain, 1.0], count), source=fixes_name(number), course=True
+    )
     # a receiver that jumps, or is led astray by a wall, goes where no vehicle does: its steps lose weight
     course = replace(course, sigma=course.sigma / np.sqrt(huber(np.abs(course.residual) / course.sigma, STEP_SIGMAS)))
     if fixes_name(number) not in unknowns.names:
         return [course]
     mean = _mean_factor(residual, position[middle], (knot, weights), time_s, sigma, given, unknowns)
-    return [course, replace(mean, sigma=np.sqrt(mean.sigma**2 + left.doubt_m2))]
+    return [course, replace(mean, sigma=np.sqrt(mean.sigma**2 + left.doubt_m2), source=course.source)]
 
 
 SAMPLES: Final = 8
@@ -353,7 +355,8 @@ def _mean_factor(
     builder.by(row, "world.turn", np.stack([-cross(centre)[axis, axis] for axis in range(3)])[None])
     builder.by(row, "world.shift", eye(1))
     deviation = mean_sigma(time_s, sigma, weights, given.tau_s, given.white_m)
-    return Factor("position mean", (weights * residual).sum(axis=0), builder.matrix(), deviation, errors=Errors.ANCHOR)
+    mean = (weights * residual).sum(axis=0)
+    return Factor("position mean", mean, builder.matrix(), deviation, errors=Errors.ANCHOR)
 
 
 def mean_weights(off_m: Array, sigma: Array) -> Array:

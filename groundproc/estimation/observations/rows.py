@@ -162,6 +162,10 @@ class Factor:
         Whether single rows touch much of the path: they are few, and kept out of the sparse normal matrix.
     errors : Errors
     carrying : Carrying, optional
+    source : str
+        Whose errors these are, where residuals judge how large they are stated: rows are three to a second, east, north, up.
+    course : bool
+        Whether rows are the whitened changes of such errors.
     """
 
     name: str
@@ -171,6 +175,8 @@ class Factor:
     wide: bool = False
     errors: Errors = Errors.OWN
     carrying: Carrying | None = None
+    source: str = ""
+    course: bool = False
 
     def rms(self) -> float:
         """Root mean square of the residuals in sigmas."""

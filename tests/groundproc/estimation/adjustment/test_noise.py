@@ -39,7 +39,7 @@ def posed(unknowns: Unknowns) -> tuple[Problem, Noise]:
     factors = [gyro, felt, *factors]
     linear = problem(rows, factors, unknowns, DEFLATION, path)
     x, _ = linear.solve(-linear.gradient)
-    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x)
+    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x, linear.coarse)
 
 
 def parts(noise: Noise, values: Array) -> list[Array]:
