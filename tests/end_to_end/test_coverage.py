@@ -26,7 +26,7 @@ from flightlog.logfile import LogReader
 from groundproc.accuracy.poses import PoseSeries, common_poses
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
-from groundproc.estimation.adjustment.windows import MISALIGNMENT_RAD
+from groundproc.estimation.adjustment.skew import MISALIGNMENT_RAD
 from groundproc.estimation.consensus import POSITION_TAU_S
 from groundproc.estimation.method import gather
 from groundproc.estimation.observations.attitudes import ATTITUDE_SIGMA_RAD, COMPASS_PRIOR

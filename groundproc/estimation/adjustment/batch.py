@@ -141,7 +141,9 @@ class Batch:
         self.take(unknowns, self.share * x)
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(asked).sum(axis=1).mean()))
         self.told()
-        return Posterior(linear, unknowns, lambda: noise_of(rows, clusters, before, DEFLATION, factors, x, linear.coarse))
+        return Posterior(
+            linear, unknowns, lambda: noise_of(rows, clusters, before, DEFLATION, factors, x, linear.coarse)
+        )
 
     def _damp(self, asked: Array) -> None:
         """Take less of steps that swing to and fro, as much as would have ended the last swing (Irons and Tuck 1969).

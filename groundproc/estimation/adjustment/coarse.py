@@ -133,7 +133,7 @@ class Coarse:
     def nodes(self) -> int:
         """How many there are."""
         globals_ = self.prolongation.shape[0] - self.rigid.shape[0]
-        return (self.prolongation.shape[1] - globals_) // 6
+        return int(self.prolongation.shape[1] - globals_) // 6
 
     def solve(self, right: Array) -> Array:
         """The best coarse solution, shape as `right`: (unknowns,) or (unknowns, m)."""

@@ -144,6 +144,7 @@ class Joining:
         for voxel_m, cut in ROUNDS:
             last = self.step(voxel_m, cut)
         last = self._hold(last)
+        self.log[-1] |= last.figures()
         return self._joined(last.unknowns, last.spread(DRAWS), last.datum())
 
     def _hold(self, last: Posterior) -> Posterior:
@@ -190,7 +191,9 @@ class Joining:
         for each in self.observations:
             each.take(part, self.path)
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(self.path.position_m - before.position_m).sum(axis=1).mean()))
-        return Posterior(linear, unknowns, lambda: noise_of(rows, seen.clusters, before, DEFLATION, factors, x, linear.coarse))
+        return Posterior(
+            linear, unknowns, lambda: noise_of(rows, seen.clusters, before, DEFLATION, factors, x, linear.coarse)
+        )
 
     def _joined(self, unknowns: Unknowns, spread: Spread, datum: Array) -> "Joined":
         """The correction, and its sigmas."""

@@ -8,7 +8,7 @@ gradient.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -64,6 +64,8 @@ class Noise:
         Rows of the other factors, each for an error of size one.
     anchors : csr_matrix, shape (k, unknowns)
         The same of what says where the whole lies, and of the priors.
+    strain : dict of str to ndarray
+        How many times more than stated the errors of sources of positions are, east, north, up (`straining`); in `anchors` already.
     """
 
     rows: Rows
@@ -77,6 +79,7 @@ class Noise:
     carrier: "Carrier | None"
     others: sparse.csr_matrix
     anchors: sparse.csr_matrix
+    strain: dict[str, Array] = field(default_factory=dict)
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -207,6 +210,7 @@ def noise_of(
         np.repeat(_patches(place + path.position_m[inside]), np.diff(rows.first)), step, mats, followed(path),
         walk_rad, carrier,
         sparse.vstack([none, *others], format="csr"), sparse.vstack([none, *anchors], format="csr"),
+        strain,
     )  # fmt: skip
 
 

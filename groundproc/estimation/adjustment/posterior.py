@@ -101,6 +101,10 @@ class Posterior:
             self._noise = self.find_noise()
         return self._noise
 
+    def figures(self) -> dict[str, float]:
+        """Of the last step, for the report: how many times more than stated the errors of positions are, the largest."""
+        return {"position_strain": max((float(times.max()) for times in self.noise.strain.values()), default=1.0)}
+
     def spread(self, count: int, seed: int = 1) -> Spread:
         """So many draws of the error of the solution, noise put through the same solution; and what need not be drawn."""
         rng = np.random.default_rng(seed)

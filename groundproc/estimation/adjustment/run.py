@@ -12,10 +12,10 @@ from groundproc.estimation.adjustment.bridging import along_untold_s, bridged, h
 from groundproc.estimation.adjustment.joining import Joined
 from groundproc.estimation.adjustment.sensorpath import lost, of_ins
 from groundproc.estimation.adjustment.windows import (
-    UNSEEN,
     Sources,
     Window,
     corrections_over,
+    unseen,
 )
 from groundproc.estimation.method import Given
 from groundproc.estimation.observations.fixes import SLID, SLID_SIGMAS
@@ -76,8 +76,10 @@ class Run:
         for name in self.windows[0].values:
             values = np.array([window.values[name][0] for window in self.windows])
             weights = np.array([window.values[name][1] for window in self.windows]) ** -2.0
-            sigma = np.hypot(weights.sum(axis=0) ** -0.5, UNSEEN.get(name, 0.0))
-            found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), sigma)
+            found[name] = ((weights * values).sum(axis=0) / weights.sum(axis=0), weights.sum(axis=0) ** -0.5)
+        for name, more in unseen(found, self.sources.mat_ins_lidar).items():
+            if name in found:
+                found[name] = found[name][0], np.hypot(found[name][1], more)
         return found if self.joined is None else found | self.joined.values
 
     def mount(self, nominal: Mount) -> Mount:

@@ -71,7 +71,7 @@ def _strain(factor: Factor, x: Array, coarse: Coarse, axes: Sequence[int], most:
         spread[axis::3, i :: len(axes)] = courses
     seen = whitened.T @ spread
     shown = np.eye(spread.shape[1]) - seen.T @ coarse.solve(seen)
-    return variance_factor(spread.T @ left, shown, len(axes)) ** 0.5
+    return float(np.sqrt(variance_factor(spread.T @ left, shown, len(axes))))
 
 
 def slow_courses(count: int, most: int) -> Array:

@@ -19,6 +19,7 @@ from groundproc.estimation.adjustment.loops import closed_loops
 from groundproc.estimation.adjustment.patches import Patches, all_of, coarse, patches_of
 from groundproc.estimation.adjustment.poses import PoseErrors, pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread, joined
+from groundproc.estimation.adjustment.skew import misalignment_rad
 from groundproc.estimation.observations import lasers
 from groundproc.estimation.observations.inertial import carried_density, gyro_readings, retiming_of
 from groundproc.estimation.observations.lidar import Lidar
@@ -39,13 +40,8 @@ Array = npt.NDArray[np.float64]
 WINDOW: Final = 2400
 """Slices of a window, four minutes: most flights of a multirotor are one to three windows, and one takes about 1 GB."""
 OVERLAP: Final = 200
-MISALIGNMENT_RAD: Final = np.deg2rad(0.2)
-"""How far the axes of a cheap gyro are from those of its board (cross-axis sensitivity of its class, one sigma): the boresight is found
-through the gyro, and no flight tells the two apart."""
 LEVER_FLOOR_M: Final = 0.003
-"""The same for the lever arm, which is found through accelerometers whose axes are no better."""
-UNSEEN: Final = {"ins.turn": MISALIGNMENT_RAD, "ins.lever": LEVER_FLOOR_M}
-"""Uncertainty that the residuals do not show, by the global that contains it."""
+"""What the residuals do not show of the lever arm: it is found through accelerometers, whose axes are no better than a gyro's (`skew`)."""
 SMOOTH: Final = 11
 SMOOTH_DRAWS: Final = 101
 """Slices over which variances of poses are averaged, and correlations of what is drawn: ten seconds hold several times the errors that
@@ -202,6 +198,7 @@ def adjust_window(
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
     spread = posterior.spread(DRAWS)
+    batch.log[-1] |= posterior.figures()
     unknowns = batch.unknowns()
     (values, exact), seen = _values(unknowns, posterior, spread, sources.exact), None
     corrections, datum, solved = None, posterior.datum(), posterior.unknowns
@@ -216,12 +213,18 @@ def adjust_window(
         seen = Seen(patches_of(lidar.clusters, batch.path, len(before)), stiffness, kept)
         # how the whole lies is asked for when all windows are joined
         spread = spread.without([solved.names[name] for name in ("world.turn", "world.shift")])
-    errors = _errors(batch.path, solved, spread, mat, lever, motion.rate_density)
+    skew_rad = misalignment_rad(values, mat) if "ins.turn" in values else 0.0
+    errors = _errors(batch.path, solved, spread, mat, lever, (motion.rate_density, skew_rad))
     return Window(
         first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
         batch.log, exact, corrections, batch.said(), seen, errors.correlation,
         carried_density(observations, motion.rate_density), datum, loops.closed, loops.apart,
     )  # fmt: skip
+
+
+def unseen(values: Mapping[str, tuple[Array, Array]], mat_ins_lidar: Array) -> dict[str, float]:
+    """Uncertainty that the residuals do not show, by the global that contains it, of what is known of all of them."""
+    return {"ins.turn": misalignment_rad(values, mat_ins_lidar), "ins.lever": LEVER_FLOOR_M}
 
 
 def corrections_over(windows: Sequence[Window]) -> tuple[Array, Array] | None:
@@ -268,9 +271,13 @@ def _values(
 
 
 def _errors(
-    path: Path, unknowns: Unknowns, spread: Spread, mat_ins_lidar: Array, lever: Array, rate_density: float
+    path: Path, unknowns: Unknowns, spread: Spread, mat_ins_lidar: Array, lever: Array, beyond: tuple[float, float]
 ) -> PoseErrors:
-    """Errors of position and of roll, pitch, heading of the ins frame at the slice boundaries."""
+    """Errors of position and of roll, pitch, heading of the ins frame at the slice boundaries.
+
+    `beyond` is what comes on top: noise of the gyro between two knots [rad/sqrt(s)], turn of the other's axes on their board [rad].
+    """
+    rate_density, skew_rad = beyond
     quat, place = path.quat[::STEPS], path.position_m[::STEPS]
     mats = frames.mat_from_quat(quat)
     to_ins = -mat_ins_lidar.T @ lever
@@ -293,8 +300,7 @@ def _errors(
 
     # what the gyro adds between two knots, the mean of a Brownian bridge
     bridge = rate_density**2 * H / 6.0
-    extra = bridge + (MISALIGNMENT_RAD**2 if "ins.turn" in unknowns.names else 0.0)
-    return pose_errors(spread, poses, pitch, smooth=SMOOTH, smooth_draws=SMOOTH_DRAWS, extra=extra)
+    return pose_errors(spread, poses, pitch, smooth=SMOOTH, smooth_draws=SMOOTH_DRAWS, extra=bridge + skew_rad**2)
 
 
 def joined_path(windows: Sequence[Window]) -> Path:

@@ -16,7 +16,8 @@ from scipy.stats import chi2
 from flightlog import frames
 from flightlog.mount import Mount
 from groundproc.estimation.adjustment.posterior import joined
-from groundproc.estimation.adjustment.windows import UNSEEN, Window, corrections_over
+from groundproc.estimation.adjustment.skew import MISALIGNMENT_RAD
+from groundproc.estimation.adjustment.windows import LEVER_FLOOR_M, Window, corrections_over
 from groundproc.estimation.calibration.compass import BINS, CompassCurve, curve_of_errors, sector_of
 from groundproc.estimation.observations import lasers
 from groundproc.estimation.observations.attitudes import COMPASS_PRIOR, compass_terms
@@ -153,7 +154,7 @@ class MountCalibration:
     def report(self, nominal: Mount) -> dict[str, Any]:
         """All of it, for calibration.json."""
         sigma = np.sqrt(np.diag(self.covariance))
-        with_axes = np.hypot(sigma, np.repeat([UNSEEN[name] for name in SHARED], 3))
+        with_axes = np.hypot(sigma, np.repeat([MISALIGNMENT_RAD, LEVER_FLOOR_M], 3))
         scale = np.array([np.rad2deg(1.0)] * 3 + [1.0] * 3)
         mount = self.mount(nominal)
         return {

@@ -320,7 +320,10 @@ def position_factors(
     time_s = (time_ns[middle] - time_ns[0]) * 1e-9
     course = whitened("position", residual, builder.matrix(), time_s, sigma, given.tau_s, given.white_m, Errors.ANCHOR)
     course = replace(
-        course, sigma=course.sigma * np.tile([left.strain, left.strain, 1.0], count), source=fixes_name(number), course=True
+        course,
+        sigma=course.sigma * np.tile([left.strain, left.strain, 1.0], count),
+        source=fixes_name(number),
+        course=True,
     )
     # a receiver that jumps, or is led astray by a wall, goes where no vehicle does: its steps lose weight
     course = replace(course, sigma=course.sigma / np.sqrt(huber(np.abs(course.residual) / course.sigma, STEP_SIGMAS)))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from flightlog.mount import Mount
 from groundproc.estimation.adjustment.run import Run
-from groundproc.estimation.adjustment.windows import MISALIGNMENT_RAD
+from groundproc.estimation.adjustment.skew import MISALIGNMENT_RAD
 from groundproc.estimation.observations.fixes import SLID_SIGMAS, Fixes
 from groundproc.estimation.observations.lasers import UNKNOWNS
 from groundproc.sensors.lasers import LaserCorrections
@@ -32,7 +32,7 @@ def run_with(restarts: int, slid: float, outside: tuple[str, ...], refuted: bool
     windows: Any = [SimpleNamespace(log=log, told={})]
     unused: Any = None
     fixes = Fixes("fixes0", unused, 0, unused)
-    sources: Any = SimpleNamespace(observations=[fixes], leads=lambda: bool(outside))
+    sources: Any = SimpleNamespace(observations=[fixes], leads=lambda: bool(outside), mat_ins_lidar=np.eye(3))
     return Run(windows, unused, track, unused, sources, refuted=refuted)
 
 

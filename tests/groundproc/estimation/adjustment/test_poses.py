@@ -58,7 +58,6 @@ def test_an_error_of_the_unknowns_is_the_change_that_it_makes_of_each_pose(
     are those of level flight: the aircraft sways by 0.1 rad.
     """
     monkeypatch.setattr(windows, "SMOOTH", 1)
-    monkeypatch.setattr(windows, "MISALIGNMENT_RAD", 0.0)
     mount = Mount().with_lidar(yaw_deg=3.0, roll_deg=-2.0)
     mat, lever = mount.mat_ins_lidar(), mount.lidar_position_m()
     to_ins, path = -mat.T @ lever, circle()
@@ -70,7 +69,7 @@ def test_an_error_of_the_unknowns_is_the_change_that_it_makes_of_each_pose(
     before = pose_of(path, mat.T, to_ins)
     changed = pose_of(moved, rotated(part["ins.turn"]) @ mat.T, to_ins + part["ins.lever"]) - before
     changed[:, 3:] = (changed[:, 3:] + np.pi) % (2 * np.pi) - np.pi
-    found = windows._errors(path, unknowns, only_known(x[None]), mat, lever, 0.0)
+    found = windows._errors(path, unknowns, only_known(x[None]), mat, lever, (0.0, 0.0))
     for sigma, true, share in (
         (found.sigma_position_m, changed[:, :3], 0.02),
         (found.sigma_attitude_rad, changed[:, 3:], 0.11),

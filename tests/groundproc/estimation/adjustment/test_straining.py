@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 SECONDS = 60
 SIGMA_M = np.array([3.0, 3.0, 4.5])
 TAU_S = np.array([60.0, 60.0, 300.0])
-DRAWS = 200
+DRAWS = 60
 
 
 def receiver(rng: np.random.Generator, times: Array) -> Array:
@@ -24,7 +24,7 @@ def receiver(rng: np.random.Generator, times: Array) -> Array:
     steps = rng.standard_normal((SECONDS, 3)) * np.sqrt(1.0 - keep**2)
     steps[0] = rng.standard_normal(3)
     made = [lfilter([1.0], [1.0, -keep[i]], steps[:, i]) for i in range(3)]
-    return np.stack(made, axis=1) * SIGMA_M * times
+    return np.asarray(np.stack(made, axis=1) * SIGMA_M * times)
 
 
 def judged(error_m: Array, loose: tuple[bool, bool, bool]) -> Array:
@@ -32,9 +32,7 @@ def judged(error_m: Array, loose: tuple[bool, bool, bool]) -> Array:
     unknowns = 3 * SECONDS + 6
     matrix = sparse.hstack([sparse.eye(3 * SECONDS), sparse.csr_matrix((3 * SECONDS, 6))], format="csr")
     time_s = np.arange(float(SECONDS))
-    made = whitened(
-        "position", -error_m, matrix, time_s, np.tile(SIGMA_M, (SECONDS, 1)), TAU_S, 0.01, Errors.ANCHOR
-    )
+    made = whitened("position", -error_m, matrix, time_s, np.tile(SIGMA_M, (SECONDS, 1)), TAU_S, 0.01, Errors.ANCHOR)
     course = Factor(made.name, made.residual, made.matrix, made.sigma, errors=made.errors, source="fixes", course=True)
     held_m = np.concatenate([np.tile(np.where(loose, 100.0, 0.01), SECONDS), np.ones(6)])
     by_row = sparse.diags(1.0 / course.sigma) @ course.matrix
