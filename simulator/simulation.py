@@ -168,6 +168,7 @@ class Simulation:
             "lidar_gyro_matrix": self.telemetry.gyros.matrix.tolist(),
             "lidar_gyro_offset_deg_s": self.telemetry.gyros.bias.tolist(),
             "lidar_gyro_walk_deg_s_every_10_s": self.telemetry.gyro_wander.listed(),
+            "lidar_accel_bias_g": self.telemetry.accel_bias_g.tolist(),
             "ins_gyro_walk_deg_s_every_10_s": np.degrees(self.ins.gyro_wander.listed()).tolist(),
             "ins_accel_walk_m_s2_every_10_s": self.ins.accel_wander.listed(),
             "ins_gyro_matrix": self.ins.gyros.matrix.tolist(),

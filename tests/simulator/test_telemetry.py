@@ -122,6 +122,16 @@ def test_accelerometers_at_rest_read_the_pull_of_gravity_on_their_axes(simulate)
     assert accel_g == pytest.approx([1, 0, 1, 0, 0, 0], abs=0.0007)
 
 
+def test_a_bias_of_the_accelerometers_is_of_the_force_on_the_lidars_axes(simulate):
+    """Six readings of three axes: z, -x, z, -y, x, -y."""
+    options = dark(perfect(Options()))
+    biased = simulate("panels", 1.0, replace(options, gyros=replace(options.gyros, accel_bias_g=0.05)))
+    x, y, z = biased.truth["lidar_accel_bias_g"]
+    assert 0.01 < np.abs([x, y, z]).max() < 0.2
+    accel_g = values_of(biased.capture.payloads(512))[:, [2, 3, 6, 7, 10, 11]].mean(axis=0) * 0.001221
+    assert accel_g == pytest.approx([1 + z, -x, 1 + z, -y, x, -y], abs=0.0007)
+
+
 def test_zero_offsets_and_noise_are_those_asked_for(simulate):
     still = simulate("panels", 3.0, dark(Options()))
     gyros = values_of(still.capture.payloads(512))[:, [0, 4, 8]] * 0.09766
