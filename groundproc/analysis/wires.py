@@ -19,9 +19,10 @@ from groundproc.analysis.corridor.catenary import Catenary
 from groundproc.analysis.corridor.chains import chained
 from groundproc.analysis.corridor.clearance import Clearance
 from groundproc.analysis.corridor.poles import HALO_M, Pole, upright
-from groundproc.analysis.corridor.spans import conductors
+from groundproc.analysis.corridor.spans import attached, conductors
 from groundproc.analysis.corridor.strips import FENCE_HEIGHTS_M, fence, stay
 from groundproc.analysis.corridor.thin import RADIUS_M, thin_points
+from groundproc.analysis.corridor.whole import Whole
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
 from groundproc.cloud.classes import (
@@ -209,7 +210,11 @@ def _sort_lines(task: Task, floor: Floor, xyz_m: Array, direction: Array, made: 
     chains = [
         xyz_m[flat & tall][each] for each in chained(xyz_m[flat & tall], direction[flat & tall], 6, 5.0, made.poles)
     ]
-    made.wires = conductors(chains, made.poles)
+    whole = Whole(conductors(chains))
+    for _, xyz, noise in floor.pieces():
+        whole.add(xyz[~noise])
+    wires = whole.fitted()
+    made.wires = [attached(each, wires, made.poles) for each in wires]
     made.guard = _guards(made.wires)
     steep = np.abs(direction[:, 2]) > 0.4
     for each in chained(xyz_m[steep], direction[steep], 6, 2.0):

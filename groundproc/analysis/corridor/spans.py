@@ -53,18 +53,16 @@ class _Meeting(NamedTuple):
     turn: float
 
 
-def conductors(chains: Sequence[Array], poles: Sequence[Pole]) -> list[Catenary]:
-    """Wires, one for each conductor and span.
+def conductors(chains: Sequence[Array]) -> list[Catenary]:
+    """Wires, one for each conductor and span, from the first of its points to the last.
 
     Parameters
     ----------
     chains : sequence of ndarray, shape (n, 3)
-    poles : sequence of Pole
     """
     pieces = [part for chain in chains for part in cut(chain)]
     whole = settled(joined(pieces))
-    wires = [wire for wire, points in zip(map(fitted, whole), whole, strict=True) if _sound(wire, points)]
-    return [attached(each, wires, poles) for each in wires]
+    return [wire for wire, points in zip(map(fitted, whole), whole, strict=True) if _sound(wire, points)]
 
 
 def cut(points_m: Array, depth: int = 0) -> list[Array]:
