@@ -35,11 +35,13 @@ _DEAD: Final = (0.4, 3.0)
 """Of the pulses into a dead crown more than this share go through, and so many sigmas more than through the usual one."""
 _PEAK_M: Final = 0.8
 _FEWEST: Final = 6
-_LINE_M: Final = 0.12
-"""A crown that scatters less than this to both sides, and so many times as far along, is a stretch of wire ..."""
-_LINE_RATIO: Final = 3.0
+_FULL: Final = 0.5
+"""A crown of which more than this has points, seen from above, is of leaves, unless it is so many times as long as wide ..."""
+_LONG: Final = 3.0
 _WIRE_M: Final = 4.0
-"""... if most of what is high within this of it lies on thin lines too."""
+"""... and one of less is a stretch of wires, if thin lines are found so far around it ..."""
+_WIRES: Final = 0.7
+"""... that this share of its points lies on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,22 +119,29 @@ def crowns(xyz_m: Array, above_m: npt.NDArray[np.float32], least_m: float) -> li
         high = above_m[some] > 0.5 * tree.height_m
         if tree.height_m < least_m:
             continue
-        if not tree.stem and _a_line(xyz_m[some][high, :2]):
-            near = np.flatnonzero((above_m > 0.5 * least_m) & (np.hypot(*(xyz_m[:, :2] - tree.top).T) < _WIRE_M))
-            if len(thin_points(xyz_m[near], np.ones(len(near), np.bool_)).xyz_m) > 0.5 * _voxels(xyz_m[near]):
-                continue
+        if not tree.stem and _thin(xyz_m, above_m, some[high], area, least_m):
+            continue
         found.append(tree)
     return found
 
 
-def _a_line(xy_m: Array) -> bool:
-    """Whether points lie along a line, seen from above, as those of a wire do."""
-    if len(xy_m) < 3:
+def _thin(
+    xyz_m: Array, above_m: npt.NDArray[np.float32], crown: npt.NDArray[np.int64], area: float, least_m: float
+) -> bool:
+    """Whether a crown, by the numbers of its points, is a stretch of one wire or of several."""
+    if len(crown) < 3:
         return False
-    across, along = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(xy_m.T)), 0.0))
-    # a few points of a crown lie in a line by chance
-    widest_m = _LINE_M * min((len(xy_m) - 2) / (_FEWEST - 2), 1.0)
-    return bool(across < widest_m and along > _LINE_RATIO * across)
+    wide, long = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(xyz_m[crown, :2].T)), 0.0))
+    flat = np.column_stack([xyz_m[crown, :2], np.zeros(len(crown))])
+    if _voxels(flat) * VOXEL_M**2 > _FULL * area and long < _LONG * wide:
+        return False  # most crowns: where points lie on all of it there are no wires, and lines need not be looked for
+    near = (above_m > 0.5 * least_m) & (
+        np.abs(xyz_m[:, :2] - xyz_m[crown, :2].mean(axis=0)) < 2.0 * long + _WIRE_M
+    ).all(axis=1)
+    lines = thin_points(xyz_m[near], np.ones(int(near.sum()), np.bool_)).xyz_m
+    if not len(lines):
+        return False
+    return bool(np.mean(cKDTree(lines).query(xyz_m[crown])[0] < VOXEL_M) > _WIRES)
 
 
 def _voxels(xyz_m: Array) -> int:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import shapely
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from groundproc.analysis.terrain.building import roof_outlines, roofs
+from groundproc.analysis.terrain.building import LOW_M, roof_outlines, roofs
 from groundproc.analysis.terrain.floor import FILL_M, Floor
 from groundproc.analysis.terrain.holdout import HoldOut
 from groundproc.analysis.terrain.settings import Settings, settings_for
@@ -132,6 +132,7 @@ class _Area:
     def survey(self) -> None:
         """Mean heights of the ground, and tops of all."""
         ground, top = Cells(self.settings.cell_m, {"mean", "sigma", "count"}), Cells(self.settings.cell_m, {"max"})
+        low = Cells(self.settings.cell_m, {"count"})
         grass_m: float | None = None
         for _, xyz, noise in self.floor.pieces():
             above, kind = self.floor.heights(xyz, noise)
@@ -144,9 +145,11 @@ class _Area:
             ground.add(xyz[bare], xyz[bare, 2] - self.floor.base.bilinear(xyz[bare]))
             seen = (kind != LOW_NOISE) & (kind != HIGH_NOISE)
             top.add(xyz[seen], xyz[seen, 2])
-        self._model(ground, top)
+            under = seen & (above < LOW_M)
+            low.add(xyz[under], above[under])
+        self._model(ground, top, low)
 
-    def _model(self, ground: Cells, top: Cells) -> None:
+    def _model(self, ground: Cells, top: Cells, low: Cells) -> None:
         """Terrain, its sigma, canopy and roofs."""
         cell_m, folder = self.settings.cell_m, self.folder
         self.terrain, self.sigma = Sheet(self.grid, folder), Sheet(self.grid, folder)
@@ -169,7 +172,7 @@ class _Area:
             cut(inside)[:] = True
             self.made.holdout.add(residual, inside, number)
             highest = top.window(around, "max")
-            roof = roofs(highest, fill(base), cell_m)
+            roof = roofs(highest, fill(base), low.window(around, "count"), cell_m)
             # feet of walls pass for ground
             residual[binary_dilation(roof, np.ones((3, 3), np.bool_))] = np.nan
             terrain = fill(base) + (fill(residual) if np.isfinite(residual).any() else np.float32(0.0))

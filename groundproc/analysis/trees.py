@@ -14,7 +14,7 @@ import shapely
 from scipy.spatial import cKDTree
 
 from groundproc.analysis.crowns import Tree, crowns, dead
-from groundproc.analysis.terrain.building import roofs
+from groundproc.analysis.terrain.building import LOW_M, roofs
 from groundproc.analysis.terrain.floor import Floor
 from groundproc.cloud import reader
 from groundproc.cloud.classes import BUILDING, HIGH_NOISE, OF_USES
@@ -122,13 +122,14 @@ def _lay_down(xyz_m: Array, above_m: npt.NDArray[np.float32], built: npt.NDArray
 
 def _on_roofs(xyz_m: Array, above_m: npt.NDArray[np.float32], cell_m: float) -> npt.NDArray[np.bool_]:
     """Points on buildings, as `swath ground` tells them, shape (n,)."""
-    tops, ground = Cells(cell_m, {"max"}), Cells(cell_m, {"max"})
+    tops, ground, low = Cells(cell_m, {"max"}), Cells(cell_m, {"max"}), Cells(cell_m, {"count"})
     tops.add(xyz_m, xyz_m[:, 2])
     ground.add(xyz_m, xyz_m[:, 2] - above_m)
+    low.add(xyz_m[above_m < LOW_M], above_m[above_m < LOW_M])
     grid = tops.grid()
     if grid is None:
         return np.zeros(len(xyz_m), np.bool_)
-    roof = roofs(tops.window(grid, "max"), fill(ground.window(grid, "max")), cell_m)
+    roof = roofs(tops.window(grid, "max"), fill(ground.window(grid, "max")), low.window(grid, "count"), cell_m)
     down = np.floor((grid.north_m - xyz_m[:, 1]) / cell_m).astype(np.int64).clip(0, grid.rows - 1)
     right = np.floor((xyz_m[:, 0] - grid.west_m) / cell_m).astype(np.int64).clip(0, grid.columns - 1)
     return np.asarray(roof[down, right] & (above_m > _FOOT_M))

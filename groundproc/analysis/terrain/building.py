@@ -8,7 +8,7 @@ import rasterio.features
 import shapely
 from numba import njit
 from rasterio.transform import Affine
-from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label
+from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label, uniform_filter
 
 from groundproc.analysis.terrain.surfaces import BLOCK, Sheet
 from groundproc.raster.grid import Grid, Window
@@ -28,28 +28,57 @@ _EDGE_CELLS: Final = 2
 """A plane cannot be told so near to the edge of a roof, where walls and what hangs over share its cells."""
 _FEWEST: Final = 6
 """Cells of a plane."""
+LOW_M: Final = 1.0
+"""Points lower than this above the ground came by what is high, or through it."""
+_BESIDE_M: Final = 10.0
+"""Half side of the square in which it is looked how often the ground is met beside what is high ..."""
+_THROUGH: Final = 0.5
+"""... and the share of that below it which no roof lets through: its edges share their cells with the ground, and beams come in aslant."""
+_THREE: Final = np.ones((3, 3), np.bool_)
 
 
-def roofs(top_m: Raster, ground_m: Raster, cell_m: float) -> Mask:
+def roofs(top_m: Raster, ground_m: Raster, low: Raster, cell_m: float) -> Mask:
     """Cells of buildings.
+
+    Wires lie in one plane as well, and fill cells in which no point is left out above them. But they hide nothing of what is below, and one
+    of them is no wider than two cells.
 
     Parameters
     ----------
     top_m : ndarray of float32, shape (rows, columns)
         Highest point of each cell; NaN without any.
     ground_m : ndarray of float32, shape (rows, columns)
+    low : ndarray of float32, shape (rows, columns)
+        Points of each cell lower than `LOW_M` above the ground.
     cell_m : float
     """
     high = np.isfinite(top_m) & (top_m - ground_m > LEAST_HEIGHT_M)
     half = max(round(_AROUND_M / cell_m), 1)
     rough, steep = _planes(np.where(high, top_m, np.float32(np.nan)), half, cell_m)
-    plane = high & (rough < _ROUGH_M) & (steep < _STEEPEST)
-    body = _large(binary_opening(plane, np.ones((2, 2), np.bool_)), LEAST_AREA_M2 / 2.0 / cell_m**2)
-    grown = binary_closing(np.pad(body, half), np.ones((3, 3), np.bool_), iterations=half)[half:-half, half:-half]
+    plane = high & (rough < _ROUGH_M) & (steep < _STEEPEST) & ~_open(high, low, half, cell_m)
+    wide = binary_opening(binary_closing(np.pad(high, 2), _THREE)[2:-2, 2:-2], _THREE)
+    body = _large(binary_opening(plane, np.ones((2, 2), np.bool_)) & wide, LEAST_AREA_M2 / 2.0 / cell_m**2)
+    grown = binary_closing(np.pad(body, half), _THREE, iterations=half)[half:-half, half:-half]
     grown = binary_fill_holes(grown) & (high | ~np.isfinite(top_m))
     for _ in range(_EDGE_CELLS):
         grown = _joined_edges(grown, top_m, high)
     return _large(grown, LEAST_AREA_M2 / cell_m**2)
+
+
+def _open(high: Mask, low: Raster, half: int, cell_m: float) -> Mask:
+    """Cells below whose high neighbours the ground is met as often as beside them."""
+    low = np.where(np.isfinite(low), low, 0.0).astype(np.float64)
+    below = _mean_of(low, high, 2 * half + 1)
+    beside = _mean_of(low, ~high, 2 * max(round(_BESIDE_M / cell_m), half + 1) + 1)
+    return np.asarray((beside > 0.0) & (below > _THROUGH * beside))
+
+
+def _mean_of(values: npt.NDArray[np.float64], some: Mask, side: int) -> npt.NDArray[np.float64]:
+    """Mean of some cells of the square around each; 0 without any."""
+    total = uniform_filter(np.where(some, values, 0.0), side, mode="constant")
+    share = uniform_filter(some.astype(np.float64), side, mode="constant")
+    # sums that run along a row leave rounding where nothing is
+    return np.where(share > 0.5 / side**2, total / np.maximum(share, 0.5 / side**2), 0.0)
 
 
 def _joined_edges(body: Mask, top_m: Raster, high: Mask) -> Mask:
