@@ -213,8 +213,7 @@ def _sort_lines(task: Task, floor: Floor, xyz_m: Array, direction: Array, made: 
     whole = Whole(conductors(chains))
     for _, xyz, noise in floor.pieces():
         whole.add(xyz[~noise])
-    wires = whole.fitted()
-    made.wires = [attached(each, wires, made.poles) for each in wires]
+    made.wires = attached(whole.fitted(), made.poles)
     made.guard = _guards(made.wires)
     steep = np.abs(direction[:, 2]) > 0.4
     for each in chained(xyz_m[steep], direction[steep], 6, 2.0):

@@ -8,7 +8,7 @@ import numpy.typing as npt
 import scipy.sparse
 from scipy.spatial import cKDTree
 
-from groundproc.analysis.corridor.poles import ARM_M, Pole
+from groundproc.analysis.corridor.poles import Pole
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -17,8 +17,6 @@ _GAP_M: Final = 5.0
 _OFF_M: Final = 0.08
 _LEAN: Final = 0.035
 """How far points are off each other's lines: noise, and what the direction errs by, along the way between them."""
-_ARM_SHARE: Final = 0.25
-"""Half a crossarm of a mast, in its height."""
 _TURN: Final = float(np.cos(np.deg2rad(9.0)))
 
 
@@ -62,7 +60,7 @@ def _unsupported(xyz_m: Array, a: Ints, b: Ints, poles: Sequence[Pole]) -> tuple
     tree = cKDTree(xyz_m[:, :2])
     for pole in poles:
         place = np.array([pole.x, pole.y])
-        reach = max(ARM_M, _ARM_SHARE * pole.height_m)
+        reach = pole.arm_m
         near = np.zeros(len(xyz_m), np.bool_)
         near[tree.query_ball_point(place, reach + _GAP_M)] = True
         some = np.flatnonzero(near[a] & near[b])

@@ -13,7 +13,9 @@ MAST_M: Final = 15.0
 """Higher poles are called masts."""
 HALO_M: Final = 2.0
 ARM_M: Final = 2.6
-"""Half a crossarm, and more."""
+"""Half a crossarm, and more ..."""
+_ARM_SHARE: Final = 0.25
+"""... and that of a mast, in its height."""
 _LEAST_M: Final = 3.0
 _CELL_M: Final = 0.5
 _BIN_M: Final = 0.5
@@ -27,6 +29,7 @@ _RING: Final = 0.35
 """Points around a pole, as a share of its own at the same heights: a crown has many times as many as its stem."""
 _CROWN: Final = 2.5
 """The same near its top, where crossarms and wires are."""
+_STEPS: Final = 8
 _FOOT_M: Final = 0.5
 _ON_LINE_M: Final = 0.15
 
@@ -54,6 +57,11 @@ class Pole:
     def kind(self) -> str:
         """By height."""
         return "mast" if self.height_m >= MAST_M else "pole"
+
+    @property
+    def arm_m(self) -> float:
+        """How far to the side wires may hang from it."""
+        return max(ARM_M, _ARM_SHARE * self.height_m)
 
 
 def upright(
@@ -119,7 +127,8 @@ def _pole(
 ) -> Pole | None:
     """The pole of a size near a place, if there is one."""
     core_m, inner_m, outer_m = size_m
-    for _ in range(3):
+    # from a side of a thick mast its middle is some steps away
+    for _ in range(_STEPS):
         inside = np.hypot(*(xyz_m[:, :2] - middle).T) < core_m
         if inside.sum() < _FEWEST_BINS:
             return None
@@ -143,6 +152,9 @@ def _pole(
 
 
 def _axis(xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Array:
-    """Middle of points by the middles of their levels: where wires are fastened, many points are beside it."""
+    """Middle of points by the means of their levels: where wires are fastened, many points are beside it.
+
+    Their medians would stay at a side of a thick mast, where most of the points within reach are.
+    """
     level = np.floor(above_m / _BIN_M).astype(np.int64)
-    return np.median([np.median(xyz_m[level == each, :2], axis=0) for each in np.unique(level)], axis=0)
+    return np.median([np.mean(xyz_m[level == each, :2], axis=0) for each in np.unique(level)], axis=0)

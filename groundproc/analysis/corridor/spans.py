@@ -1,5 +1,6 @@
 """Conductors from attachment to attachment, of chains of points."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -7,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.analysis.corridor.catenary import Catenary, fitted
-from groundproc.analysis.corridor.poles import ARM_M, Pole
+from groundproc.analysis.corridor.poles import Pole
 
 Array = npt.NDArray[np.float64]
 
@@ -31,6 +32,12 @@ _GROWTHS: Final = 6
 _SHARP: Final = 0.14
 """Angle [rad] at which points of 3 cm tell the place of a bend better than a pole does."""
 _BEYOND_M: Final = 3.0
+_ON_POLE_M: Final = 0.3
+"""A wire that runs so near to the axis of a pole hangs on it, and not where it crosses another one."""
+_RIVAL_M: Final = 3.0
+"""Poles that stand nearer to each other along a wire are told apart by what they bear."""
+_MIXED_M: Final = (0.1, 0.15)
+"""Beyond a bend points of the other wire are taken so far, and as far as they are on both by the sine of the bend."""
 _SETTLING: Final = 4
 _OWN_M: Final = 0.25
 """Points farther from all curves are of none."""
@@ -51,6 +58,15 @@ class _Meeting(NamedTuple):
     s_m: float
     beyond_m: float
     turn: float
+
+
+class _Bearer(NamedTuple):
+    """A pole that may bear an end: how far along the wire it is from the last point, its number, its place along the wire and beside it."""
+
+    away_m: float
+    number: int
+    s_m: float
+    aside_m: float
 
 
 def conductors(chains: Sequence[Array]) -> list[Catenary]:
@@ -232,32 +248,57 @@ def _sound(wire: Catenary, points_m: Array) -> bool:
     return bool(len(bins) >= _COVERED * wire.length_m / _BIN_M and slope < 1.0)
 
 
-def attached(wire: Catenary, wires: Sequence[Catenary], poles: Sequence[Pole]) -> Catenary:
-    """The wire as far as where it hangs: at a pole beside its end, or where the next span's curve meets its own."""
-    reach = 3.0 + 0.12 * wire.length_m
-    ends = []
-    for end, sign in ((wire.start_m, -1.0), (wire.end_m, 1.0)):
-        met, pole = _at_wire(wire, end, sign, reach, wires), _at_pole(wire, end, reach, poles)
+def attached(wires: Sequence[Catenary], poles: Sequence[Pole]) -> list[Catenary]:
+    """Wires as far as where they hang: at a pole beside the end, or where the next span's curve meets its own."""
+    ends = [(wire, end, sign) for wire in wires for end, sign in ((wire.start_m, -1.0), (wire.end_m, 1.0))]
+    beside = [_beside(wire, end, poles) for wire, end, _ in ends]
+    carried = Counter(min(each).number for each in beside if each)
+    found = []
+    for (wire, end, sign), each in zip(ends, beside, strict=True):
+        met, pole = _at_wire(wire, end, sign, wires), _support(each, carried)
         # at a bend the arms lean, and wires do not end where the pole is
         sharp = met is not None and met.turn > _SHARP and met.beyond_m < _BEYOND_M
-        found = met.s_m if met is not None and (sharp or pole is None) else pole
-        ends.append(end if found is None else found)
-    return wire.between(min(ends[0], wire.middle_of - 1.0), max(ends[1], wire.middle_of + 1.0))
+        arm = pole is None or pole.aside_m > _ON_POLE_M
+        if met is not None and arm and (sharp or pole is None):
+            found.append(met.s_m)
+        else:
+            found.append(end if pole is None else pole.s_m)
+    return [
+        wire.between(min(start, wire.middle_of - 1.0), max(end, wire.middle_of + 1.0))
+        for wire, start, end in zip(wires, found[::2], found[1::2], strict=True)
+    ]
 
 
-def _at_pole(wire: Catenary, end: float, reach: float, poles: Sequence[Pole]) -> float | None:
-    best, found = reach, None
-    for pole in poles:
-        place = np.array([[pole.x, pole.y, pole.foot_m]])
-        s, off, up = wire.local(place)
-        high = -float(up[0])
-        if abs(off[0]) <= ARM_M and abs(s[0] - end) < best and high < pole.height_m + 2.5:
-            best, found = abs(float(s[0]) - end), float(s[0])
+def _reach_m(wire: Catenary) -> float:
+    """How far from its last point a wire may hang."""
+    return 3.0 + 0.12 * wire.length_m
+
+
+def _beside(wire: Catenary, end: float, poles: Sequence[Pole]) -> list[_Bearer]:
+    """Poles that may bear an end."""
+    found = []
+    for number, pole in enumerate(poles):
+        s, off, up = wire.local(np.array([[pole.x, pole.y, pole.foot_m]]))
+        away, high = abs(float(s[0]) - end), -float(up[0])
+        if abs(off[0]) <= pole.arm_m and away < _reach_m(wire) and high < pole.height_m + 2.5:
+            found.append(_Bearer(away, number, float(s[0]), abs(float(off[0]))))
     return found
 
 
-def _at_wire(wire: Catenary, end: float, sign: float, reach: float, wires: Sequence[Catenary]) -> _Meeting | None:
-    """Where another curve goes on: that whose own end is nearest, for those beside it in a bundle meet it too, further on."""
+def _support(beside: list[_Bearer], carried: Counter[int]) -> _Bearer | None:
+    """Of poles near each other the one that most wires end at: a lamp post beside a line's pole may be nearer to one of them."""
+    if not beside:
+        return None
+    some = [each for each in beside if each.away_m < min(beside).away_m + _RIVAL_M]
+    return max(some, key=lambda each: (carried[each.number], -each.away_m))
+
+
+def _at_wire(wire: Catenary, end: float, sign: float, wires: Sequence[Catenary]) -> _Meeting | None:
+    """Where another curve goes on: that whose own end is nearest, for those beside it in a bundle meet it too, further on.
+
+    Neither goes on beyond that place: a drop from the same pole may cross a conductor in plan before both end.
+    """
+    reach = _reach_m(wire)
     here = np.append(wire.origin_m + end * wire.along, wire.height(np.array([end]))[0])
     found: _Meeting | None = None
     for other in wires:
@@ -275,5 +316,10 @@ def _at_wire(wire: Catenary, end: float, sign: float, reach: float, wires: Seque
         cost = abs(s[nearest] - end) + float(beyond)
         if apart[nearest] < 0.3 and (found is None or cost < found.beyond_m):
             turn = np.arccos(min(abs(float(wire.tangent(s[nearest]) @ other.tangent(along[nearest]))), 1.0))
+            # so far a wire is believed to go on that has points of the other one
+            within = _MIXED_M[0] + _MIXED_M[1] / max(np.sin(turn), 1e-3)
+            inside = min(along[nearest] - other.start_m, other.end_m - along[nearest])
+            if turn > _SHARP and max(sign * (end - s[nearest]), inside) > within:
+                continue
             found = _Meeting(float(s[nearest]), cost, float(turn))
     return found
