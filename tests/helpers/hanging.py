@@ -65,7 +65,10 @@ class Crown:
 
 @dataclass
 class Site:
-    """What stands on a place, and how it is flown over: pole is x, y, height, radius; house is west, south, east, north, height."""
+    """What stands on a place, and how it is flown over: pole is x, y, height, radius; house is west, south, east, north, height.
+
+    Passes are along the line, or turned against it by an angle; then there are as many as it takes to cover it.
+    """
 
     ground: Callable[[Array], Array]
     wires: list[Hung] = field(default_factory=list)
@@ -76,6 +79,8 @@ class Site:
     passes: int = 6
     speed_m_s: float = 5.0
     answers: float = 0.7
+    turned_deg: float = 0.0
+    walled: bool = False
 
     def strung(self, poles: list[Array], arms: list[tuple[float, float]], sag: float, radius_m: float = 0.01) -> None:
         """Wires from pole to pole: of each arm, so far to the left on a crossarm that halves the angle, at that height above its foot."""
@@ -100,11 +105,17 @@ def scanned(
     places = np.concatenate([each.ends_m for each in site.wires])[:, :2]
     middle = places.mean(axis=0)
     way = np.linalg.svd(places - middle)[2][0]
+    turn = np.deg2rad(site.turned_deg)
+    way = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ way
     reach = np.abs((places - middle) @ way).max() + 15.0
     across = np.array([-way[1], way[0]])
+    passes = site.passes
+    if site.turned_deg:
+        passes = max(passes, int(np.ceil(np.abs((places - middle) @ across).max() / 4.0)))
+        beams = beams * site.passes // passes
     parts, numbers = [], []
-    for number in range(site.passes):
-        lateral = (number - (site.passes - 1) / 2) * 8.0 + rng.normal(0, 1)
+    for number in range(passes):
+        lateral = (number - (passes - 1) / 2) * 8.0 + rng.normal(0, 1)
         line = middle + lateral * across
         top = max(float(site.ground(places).max()), 0.0) + site.above_m + rng.normal(0, 1)
         count = int(2 * reach / site.speed_m_s * 10)
@@ -116,7 +127,7 @@ def scanned(
         axis = np.append(way if number % 2 else -way, 0.0)
         seen, of = _on_wires(rng, site, track, axis, sigma_m)
         rest = _on_the_rest(rng, site, track, axis, beams, sigma_m)
-        points = np.concatenate([seen, rest, _on_poles(rng, site, sigma_m)])
+        points = np.concatenate([seen, rest, _on_poles(rng, site, sigma_m), _on_walls(rng, site, sigma_m)])
         parts.append(points + rng.normal(0, between_m, 3))
         numbers.append(np.append(of, np.full(len(points) - len(of), -1)))
     return np.concatenate(parts), np.concatenate(numbers)
@@ -200,91 +211,24 @@ def _on_poles(rng: np.random.Generator, site: Site, sigma_m: float) -> Array:
     return np.asarray(points + rng.normal(0, sigma_m, points.shape))
 
 
-def _poles(site: Site, places: list[tuple[float, float]], height: float, radius: float = 0.13) -> list[Array]:
+def _on_walls(rng: np.random.Generator, site: Site, sigma_m: float) -> Array:
+    """Echoes all over the walls of houses, two on a square metre in a pass."""
+    parts = [np.empty((0, 3))]
+    for west, south, east, north, height in site.houses if site.walled else ():
+        wide, deep = east - west, north - south
+        u = rng.uniform(0, 2 * (wide + deep), int(4 * (wide + deep) * height))
+        x = west + np.clip(u, 0, wide) - np.clip(u - wide - deep, 0, wide)
+        y = south + np.clip(u - wide, 0, deep) - np.clip(u - 2 * wide - deep, 0, deep)
+        foot = float(site.ground(np.array([[(west + east) / 2, (south + north) / 2]]))[0])
+        parts.append(np.column_stack([x, y, foot + rng.uniform(0, height, len(u))]))
+    points = np.concatenate(parts)
+    return np.asarray(points + rng.normal(0, sigma_m, points.shape))
+
+
+def poles_at(site: Site, places: list[tuple[float, float]], height: float, radius: float = 0.13) -> list[Array]:
     site.poles += [(x, y, height, radius) for x, y in places]
     return [np.array(each, float) for each in places]
 
 
-def _wavy(slope: float = 0.0) -> Callable[[Array], Array]:
+def wavy(slope: float = 0.0) -> Callable[[Array], Array]:
     return lambda xy: 50.0 + slope * xy[:, 0] + 1.2 * np.sin(xy[:, 0] / 23.0) * np.cos(xy[:, 1] / 31.0)
-
-
-def slope() -> Site:
-    """Three conductors up a hillside of 30 % and 45 %."""
-    site = Site(
-        lambda xy: 50.0 + 0.3 * xy[:, 0] + 0.15 * np.maximum(xy[:, 0] - 100.0, 0.0) + 0.6 * np.sin(xy[:, 1] / 13.0),
-        above_m=28.0,
-    )
-    site.strung(
-        _poles(site, [(10, 30), (85, 34), (165, 36), (238, 33)], 11.5), [(-1.2, 11.3), (0.0, 11.9), (1.2, 11.3)], 1.4
-    )
-    return site
-
-
-def bundles() -> Site:
-    """Two subconductors beside each other and four in a square, 40 cm apart, guards above, spans of 190 m."""
-    site = Site(_wavy(), above_m=48.0, passes=7)
-    poles = _poles(site, [(10, 40), (200, 44), (385, 40)], 34.0, 0.4)
-    two = [(5.8, 26.0), (6.2, 26.0)]
-    four = [(-6.2, 26.0), (-5.8, 26.0), (-6.2, 25.6), (-5.8, 25.6)]
-    site.strung(poles, two + four, 0.55, 0.014)
-    site.strung(poles, [(0.4, 34.2)], 0.4, 0.007)
-    return site
-
-
-def dead_end() -> Site:
-    """A line that ends at its last pole, and a drop from there to the eaves of a house."""
-    site = Site(_wavy(0.03), houses=[(128.0, 52.0, 140.0, 62.0, 5.0)], above_m=30.0)
-    poles = _poles(site, [(5, 30), (60, 32), (118, 33)], 9.5)
-    site.strung(poles, [(-0.5, 9.3), (0.0, 9.6), (0.5, 9.3)], 1.1)
-    eaves = float(site.ground(np.array([[134.0, 57.0]]))[0]) + 4.6
-    top = float(site.ground(np.array([[118.0, 33.0]]))[0]) + 8.6
-    site.wires.append(Hung(np.array([[118.0, 33.0, top], [131.0, 52.0, eaves]]), 60.0, 0.012))
-    return site
-
-
-def angle() -> Site:
-    """Bends of 60 and of 25 deg, with crossarms that halve them."""
-    site = Site(_wavy(0.05), above_m=32.0, passes=7)
-    poles = _poles(site, [(5, 20), (80, 22), (118, 86), (168, 128)], 13.0, 0.2)
-    site.strung(poles, [(-1.6, 12.6), (1.6, 12.6), (0.0, 13.4)], 1.6)
-    return site
-
-
-def low_voltage() -> Site:
-    """Four bare wires above each other, 30 cm apart, and an insulated bundle on the other side."""
-    site = Site(_wavy(), above_m=25.0)
-    poles = _poles(site, [(5, 30), (43, 31), (82, 33), (119, 32)], 8.2)
-    site.strung(poles, [(0.15, 8.0), (0.15, 7.7), (0.15, 7.4), (0.15, 7.1)], 1.2, 0.006)
-    site.strung(poles, [(-0.2, 6.6)], 1.6, 0.02)
-    return site
-
-
-def trees() -> Site:
-    """Crowns a metre and less from the outer conductor, some below the wires."""
-    site = Site(_wavy(), above_m=30.0)
-    poles = _poles(site, [(5, 30), (70, 31), (138, 33)], 10.0)
-    site.strung(poles, [(-1.1, 9.8), (0.0, 10.3), (1.1, 9.8)], 1.3)
-    rng = np.random.default_rng(7)
-    for x in np.arange(12.0, 135.0, 6.5):
-        radius, side = rng.uniform(1.6, 2.6), (-1.0 if rng.random() < 0.5 else 1.0)
-        ground = float(site.ground(np.array([[x, 31.0]]))[0])
-        y = 30.0 + 0.02 * x + side * (1.1 + radius + rng.uniform(0.4, 1.2))
-        site.crowns.append(Crown(float(x), float(y), ground + 7.5, float(radius), 4.0))
-    for x in (33.0, 55.0, 96.0, 115.0):
-        ground = float(site.ground(np.array([[x, 31.0]]))[0])
-        site.crowns.append(Crown(x, 30.5, ground + 4.0, 2.2, 3.2))
-    return site
-
-
-def telephone() -> Site:
-    """Two thin slack wires at low poles."""
-    site = Site(_wavy(), above_m=25.0, answers=0.5)
-    poles = _poles(site, [(5, 30), (52, 31), (97, 29), (146, 32)], 6.8)
-    site.strung(poles, [(0.15, 6.6), (-0.15, 6.3)], 2.6, 0.004)
-    return site
-
-
-SITES: dict[str, Callable[[], Site]] = {
-    each.__name__: each for each in (slope, bundles, dead_end, angle, low_voltage, trees, telephone)
-}

@@ -157,4 +157,4 @@ def _axis(xyz_m: Array, above_m: npt.NDArray[np.float32]) -> Array:
     Their medians would stay at a side of a thick mast, where most of the points within reach are.
     """
     level = np.floor(above_m / _BIN_M).astype(np.int64)
-    return np.median([np.mean(xyz_m[level == each, :2], axis=0) for each in np.unique(level)], axis=0)
+    return np.asarray(np.median([np.mean(xyz_m[level == each, :2], axis=0) for each in np.unique(level)], axis=0))

@@ -67,9 +67,9 @@ def roofs(top_m: Raster, ground_m: Raster, low: Raster, cell_m: float) -> Mask:
 
 def _open(high: Mask, low: Raster, half: int, cell_m: float) -> Mask:
     """Cells below whose high neighbours the ground is met as often as beside them."""
-    low = np.where(np.isfinite(low), low, 0.0).astype(np.float64)
-    below = _mean_of(low, high, 2 * half + 1)
-    beside = _mean_of(low, ~high, 2 * max(round(_BESIDE_M / cell_m), half + 1) + 1)
+    points = np.where(np.isfinite(low), low, 0.0).astype(np.float64)
+    below = _mean_of(points, high, 2 * half + 1)
+    beside = _mean_of(points, ~high, 2 * max(round(_BESIDE_M / cell_m), half + 1) + 1)
     return np.asarray((beside > 0.0) & (below > _THROUGH * beside))
 
 

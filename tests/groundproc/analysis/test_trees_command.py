@@ -68,17 +68,23 @@ def test_bushes_are_listed_when_asked_for(tmp_path: Path) -> None:
 
 
 def test_houses_and_wires_are_no_trees(tmp_path: Path) -> None:
-    """A roof of tiles, a wire aslant, and what another program classed as a building; three trees are left."""
+    """A roof of tiles, a wire aslant, two beside each other on edges of cells, and what another program classed as a building.
+
+    Three trees are left.
+    """
     rng = np.random.default_rng(4)
     ground = np.column_stack([rng.uniform(0, 50, (30_000, 2)), np.zeros(30_000)])
     house = (np.abs(ground[:, 0] - 15) < 5) & (np.abs(ground[:, 1] - 12) < 4)
     ground[house, 2] = 5.0 + 0.8 * (4 - np.abs(ground[house, 1] - 12)) + rng.normal(0, 0.02, house.sum())
     along = rng.uniform(0, 1, 700)
     wire = np.column_stack([50 * along, 20 + 25 * along, 9 + 4 * (along - 0.5) ** 2]) + rng.normal(0, 0.01, (700, 3))
+    level = [
+        np.column_stack([50 * along, np.full(700, y), 8 + along]) + rng.normal(0, 0.02, (700, 3)) for y in (2.0, 3.0)
+    ]
     trees = [(30.0, 10.0), (40.0, 15.0), (10.0, 40.0)]
     crowns = [np.array([*at, 6.0]) + 1.5 * sphere(rng, 900) * (1, 1, 1.5) for at in trees]
     shed = np.column_stack([rng.uniform(30, 33, (900, 1)), rng.uniform(40, 43, (900, 1)), rng.uniform(0, 4, (900, 1))])
-    xyz = np.concatenate([ground, wire, *crowns, shed])
+    xyz = np.concatenate([ground, wire, *level, *crowns, shed])
     kind = np.zeros(len(xyz), np.uint8)
     kind[-len(shed) :] = 6
     found = listed(tmp_path, xyz, kind=kind)

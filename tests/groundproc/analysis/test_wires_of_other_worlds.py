@@ -5,6 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import hanging
+import hangingsites
 import laspy
 import numpy as np
 import pytest
@@ -43,13 +44,13 @@ def found(wire: hanging.Hung, lines: list[tuple[np.ndarray, float]]) -> int | No
         # a world of many: one in the quick suite
         pytest.param("angle", 0.03, 0.04, marks=SOAK),
         ("telephone", 0.5, 0.02),
-        *(pytest.param(name, answers, 0.03, marks=SOAK) for name in hanging.SITES for answers in (0.06, 0.7)),
+        *(pytest.param(name, answers, 0.03, marks=SOAK) for name in hangingsites.SITES for answers in (0.06, 0.7)),
     ],
 )
 def test_every_span_is_found_with_its_sag_and_its_clearance(
     name: str, answers: float, between_m: float, tmp_path: Path
 ) -> None:
-    site = hanging.SITES[name]()
+    site = hangingsites.SITES[name]()
     site.answers = answers
     xyz, _ = hanging.scanned(site, 1, between_m=between_m, beams=12_000)
     cloud = write_cloud(tmp_path / "c.laz", xyz)
