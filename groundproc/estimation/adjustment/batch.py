@@ -11,6 +11,7 @@ import numpy.typing as npt
 from groundproc.estimation.adjustment.noise import noise_of
 from groundproc.estimation.adjustment.posterior import Posterior, whole_covariance
 from groundproc.estimation.adjustment.solve import problem
+from groundproc.estimation.adjustment.straining import strains
 from groundproc.estimation.observations.lidar import DEFLATION, Lidar
 from groundproc.estimation.observations.observation import Observation, State
 from groundproc.estimation.observations.rows import Factor, Unknowns, prior_factor, turned
@@ -142,7 +143,11 @@ class Batch:
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(asked).sum(axis=1).mean()))
         self.told()
         return Posterior(
-            linear, unknowns, lambda: noise_of(rows, clusters, before, DEFLATION, factors, x, linear.coarse)
+            linear,
+            unknowns,
+            lambda: noise_of(
+                rows, clusters, before, DEFLATION, factors, x, strains(factors, x, linear.coarse, figures)
+            ),
         )
 
     def _damp(self, asked: Array) -> None:

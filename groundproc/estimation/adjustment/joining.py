@@ -26,6 +26,7 @@ from groundproc.estimation.adjustment.patches import Patches, coarse
 from groundproc.estimation.adjustment.poses import pose_errors
 from groundproc.estimation.adjustment.posterior import Posterior, Spread
 from groundproc.estimation.adjustment.solve import problem
+from groundproc.estimation.adjustment.straining import strains
 from groundproc.estimation.observations.lidar import DEFLATION
 from groundproc.estimation.observations.observation import Observation, State
 from groundproc.estimation.observations.planes import Rows, places, rows_of
@@ -192,7 +193,11 @@ class Joining:
             each.take(part, self.path)
         self.log[-1]["moved_m"] = float(np.sqrt(np.square(self.path.position_m - before.position_m).sum(axis=1).mean()))
         return Posterior(
-            linear, unknowns, lambda: noise_of(rows, seen.clusters, before, DEFLATION, factors, x, linear.coarse)
+            linear,
+            unknowns,
+            lambda: noise_of(
+                rows, seen.clusters, before, DEFLATION, factors, x, strains(factors, x, linear.coarse, figures)
+            ),
         )
 
     def _joined(self, unknowns: Unknowns, spread: Spread, datum: Array) -> "Joined":

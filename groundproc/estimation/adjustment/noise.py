@@ -7,7 +7,7 @@ is S: it turns independent numbers of size one, several for each source, into th
 gradient.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -17,8 +17,7 @@ from numba import njit
 from scipy import sparse
 
 from flightlog import frames
-from groundproc.estimation.adjustment.coarse import Coarse
-from groundproc.estimation.adjustment.straining import of_source, strains
+from groundproc.estimation.adjustment.straining import of_source
 from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.observations.rows import PRIOR, Errors, Factor
 from groundproc.estimation.odometry.clusters import Clusters
@@ -33,6 +32,7 @@ Numbers = npt.NDArray[np.int32]
 
 LASTING_ROWS: Final = 20
 """Rows on end (of a tenth of a second each) whose errors are taken to go together: what lasts longer is found as a bias or a scale."""
+NONE_STRAINED: Final[Mapping[str, Array]] = {}
 PATCH_M: Final = 4.0
 """Edge of the cubes within which what a surface is not goes together: with larger ones the spread of simulated flights grows no more."""
 
@@ -181,10 +181,15 @@ class Carrier:
 
 
 def noise_of(
-    rows: Rows, clusters: Clusters, path: Path, deflation: float, factors: Sequence[Factor], x: Array, coarse: Coarse
+    rows: Rows,
+    clusters: Clusters,
+    path: Path,
+    deflation: float,
+    factors: Sequence[Factor],
+    x: Array,
+    strain: Mapping[str, Array] = NONE_STRAINED,
 ) -> Noise:
     """The sources of errors about a solution `x` of a problem that is linear about `path`; where no gyro carries it, none between knots."""
-    strain = strains(factors, x, coarse)
     step = np.clip((clusters.time_ns - path.start_ns) // path.step_ns, 0, len(path.quat) - 2).astype(np.int32)
     step = step[rows.cluster]
     mats = frames.mat_from_quat(path.quat)
@@ -210,7 +215,7 @@ def noise_of(
         np.repeat(_patches(place + path.position_m[inside]), np.diff(rows.first)), step, mats, followed(path),
         walk_rad, carrier,
         sparse.vstack([none, *others], format="csr"), sparse.vstack([none, *anchors], format="csr"),
-        strain,
+        dict(strain),
     )  # fmt: skip
 
 

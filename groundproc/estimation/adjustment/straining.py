@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from groundproc.estimation.adjustment.coarse import Coarse
+from groundproc.estimation.observations.fixes import SLID, SLID_SIGMAS
 from groundproc.estimation.observations.rows import Factor
 
 Array = npt.NDArray[np.float64]
@@ -35,8 +36,11 @@ HORIZONTAL: Final = (0, 1)
 UPWARD: Final = (2,)
 
 
-def strains(factors: Sequence[Factor], x: Array, coarse: Coarse) -> dict[str, Array]:
+def strains(factors: Sequence[Factor], x: Array, coarse: Coarse, figures: Mapping[str, float]) -> dict[str, Array]:
     """Times that errors are larger than stated, east, north, up, shape (3,) and 1 at least, by the source of a course.
+
+    None where the path slides away from its fixes: then one of the two is wrong, and which one is judged by the sigmas as stated
+    (`refuting`).
 
     Parameters
     ----------
@@ -46,7 +50,11 @@ def strains(factors: Sequence[Factor], x: Array, coarse: Coarse) -> dict[str, Ar
         Solution of the problem that they are of.
     coarse : Coarse
         Of that problem.
+    figures : mapping of str to float
+        Of the step that it is of.
     """
+    if figures.get(SLID, 0.0) > SLID_SIGMAS:
+        return {}
     found: dict[str, Array] = {}
     for factor in factors:
         if factor.course and factor.source:

@@ -5,7 +5,6 @@ import numpy.typing as npt
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from groundproc.estimation.adjustment import noise as noise_module
 from groundproc.estimation.adjustment.noise import LASTING_ROWS, PATCH_M, Noise, followed, lasting, noise_of
 from groundproc.estimation.adjustment.posterior import Posterior
 from groundproc.estimation.adjustment.solve import Problem, problem
@@ -40,22 +39,20 @@ def posed(unknowns: Unknowns) -> tuple[Problem, Noise]:
     factors = [gyro, felt, *factors]
     linear = problem(rows, factors, unknowns, DEFLATION, path)
     x, _ = linear.solve(-linear.gradient)
-    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x, linear.coarse)
+    return linear, noise_of(rows, clusters, path, DEFLATION, factors, x)
 
 
 def test_sources_that_are_worse_than_stated_err_by_that_much_more(
-    unknowns: Unknowns, monkeypatch: pytest.MonkeyPatch
+    unknowns: Unknowns,
 ) -> None:
-    """In the errors alone: the normal matrix is the one of before."""
     path = circle()
     clusters = room(path)
     rows = rows_of(clusters, path, 1.0, 10**6, cut=False)
     factors = factors_of(unknowns)
     factors[1].source = "fixes"
-    linear, x = problem(rows, factors, unknowns, DEFLATION, path), np.zeros(unknowns.size)
-    stated = noise_of(rows, clusters, path, DEFLATION, factors, x, linear.coarse)
-    monkeypatch.setattr(noise_module, "strains", lambda *_: {"fixes": np.array([1.0, 2.0, 3.0])})
-    worse = noise_of(rows, clusters, path, DEFLATION, factors, x, linear.coarse)
+    x = np.zeros(unknowns.size)
+    stated = noise_of(rows, clusters, path, DEFLATION, factors, x)
+    worse = noise_of(rows, clusters, path, DEFLATION, factors, x, {"fixes": np.array([1.0, 2.0, 3.0])})
     times = worse.anchors.power(2).sum(axis=1) / stated.anchors.power(2).sum(axis=1)
     np.testing.assert_allclose(np.ravel(times)[:4], [1.0, 4.0, 9.0, 1.0])
     assert worse.strain["fixes"].max() == 3.0

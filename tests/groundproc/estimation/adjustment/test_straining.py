@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 
 from groundproc.estimation.adjustment.coarse import Coarse
 from groundproc.estimation.adjustment.straining import of_source, strains
+from groundproc.estimation.observations.fixes import SLID
 from groundproc.estimation.observations.rows import Errors, Factor, whitened
 
 Array = npt.NDArray[np.float64]
@@ -40,7 +41,8 @@ def judged(error_m: Array, loose: tuple[bool, bool, bool]) -> Array:
     factor = cho_factor(normal)
     coarse = Coarse(np.zeros((unknowns, 6)), sparse.identity(unknowns, format="csr"), factor)
     x = -coarse.solve(by_row.T @ (course.residual / course.sigma))
-    found = strains([course], x, coarse)["fixes"]
+    found = strains([course], x, coarse, {SLID: 3.0})["fixes"]
+    assert not strains([course], x, coarse, {SLID: 6.5})  # the path slides away: it may be the one that is wrong
     mean = Factor("position mean", np.zeros(3), matrix[:3], np.ones(3), source="fixes")
     np.testing.assert_array_equal(of_source({"fixes": found}, mean), found)
     assert found[0] == found[1]  # one receiver in plan
