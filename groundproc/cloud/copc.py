@@ -13,7 +13,7 @@ import numpy.typing as npt
 from laspy.vlrs.known import LasZipVlr
 
 from flightlog.errors import SourceError
-from groundproc.cloud.octree import Cube, Key, Octree
+from groundproc.cloud.octree import MOST, CrowdError, Cube, Key, Octree
 from groundproc.cloud.spool import Records
 from groundproc.machine.readahead import ahead
 from groundproc.machine.system import cores
@@ -58,7 +58,7 @@ class CopcBuilder:
         Raises
         ------
         SourceError
-            It cannot be written.
+            It cannot be written, or the points of one place are too many for a node.
         """
         try:
             with path.open("wb+") as file:
@@ -67,6 +67,13 @@ class CopcBuilder:
             raise SourceError(f"{path}: cannot be written ({error.strerror or error})") from None
         except lazrs.LazrsError as error:  # what it makes of a full disk
             raise SourceError(f"{path}: cannot be written ({' '.join(str(error).split())})") from None
+        except CrowdError as error:
+            x, y, z = np.array(error.steps) * self._header.scales + self._header.offsets
+            raise SourceError(
+                f"{path}: {error.count:,} points of ({x:.3f}, {y:.3f}, {z:.3f}) and around it would be in one node of the octree, expected "
+                f"{MOST:,} at most, as readers unpack a node whole: millions lie within a millimetre or two there; is that a sensor that "
+                "stood still, or places that are no places? Leave cloud.copc.laz out (products), or leave these points out (times, area)"
+            ) from None
 
     def _write(self, file: BinaryIO) -> None:
         header, cube = self._header, self._octree.cube()

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog.errors import SourceError
 from groundproc.cloud.octreelevels import LEVELS, ROOT_BITS, VOXEL_BITS, key_of, levels, numbered
 from groundproc.cloud.octreeparts import Square, cells_of, count_cells, parts_of
 from groundproc.cloud.spool import Place, Records, Spool, joined
@@ -66,6 +65,22 @@ class Cube:
         return out
 
 
+class CrowdError(Exception):
+    """So many points lie within the smallest square that no node can take them.
+
+    Attributes
+    ----------
+    count : int
+        Points of one node.
+    steps : tuple of int
+        X, Y, Z of one of them in stored steps.
+    """
+
+    def __init__(self, count: int, steps: tuple[int, int, int]) -> None:
+        super().__init__(f"{count} points at {steps}")
+        self.count, self.steps = count, steps
+
+
 class Octree:
     """Takes records of LAS points in any order, and gives them by node.
 
@@ -99,7 +114,13 @@ class Octree:
         return Cube(self._low.copy(), self._scales_m * ((1 << ROOT_BITS) / side_m), side_m)
 
     def nodes(self) -> Iterator[tuple[Key, Records]]:
-        """All nodes that have points, once each; the octree is empty then."""
+        """All nodes that have points, once each; the octree is empty then.
+
+        Raises
+        ------
+        CrowdError
+            A node would hold more than `MOST` points.
+        """
         cube = self.cube()
         depth = min(max(int(np.ceil(np.log2(cube.side_m / _SQUARE_M))), 0), LEVELS)
         bits = ROOT_BITS - depth
@@ -174,10 +195,8 @@ class _Upper:
         """All of them."""
         for key, place in self._keys.items():
             if self._spool.counts[place] > MOST:
-                raise SourceError(
-                    f"{self._spool.counts[place]:,} points in one node of level {key[0]} of the octree, expected at most {MOST:,}: "
-                    "far too many lie within a millimetre; leave cloud.copc.laz out, or thin the cloud"
-                )
+                one = next(self._spool.look(place))[0]
+                raise CrowdError(self._spool.counts[place], (int(one["X"]), int(one["Y"]), int(one["Z"])))
             yield key, self._spool.take(place)
 
 

@@ -10,7 +10,7 @@ import pyproj
 import pytest
 
 from groundproc.cli import main
-from groundproc.cloud import reader
+from groundproc.cloud import copc, octree, reader
 from groundproc.cloud.exports import e57
 
 
@@ -98,6 +98,23 @@ def test_csv_has_a_header_and_digits_enough(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(rows["classification"], source.classification)
     np.testing.assert_allclose(rows["gps_time"], source.gps_time, atol=1e-9)
+
+
+def test_a_crowd_that_no_node_can_take_is_refused_with_file_and_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = cloud(tmp_path / "c.laz", 6, 20_000)
+    source.X[1000:], source.Y[1000:], source.Z[1000:] = 412_345, 123_456, 50_007
+    source.write(tmp_path / "c.laz")
+    monkeypatch.setattr(octree, "_LARGEST_PIECE", 500)
+    monkeypatch.setattr(octree, "MOST", 1_200)
+    monkeypatch.setattr(copc, "MOST", 1_200)
+    assert main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.copc.laz")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for part in ("c.copc.laz: ", "points of (533412.345, 6472123.456, 50.007)", "expected 1,200 at most", "Leave"):
+        assert part in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c.laz"]
 
 
 def test_e57_is_read_by_its_own_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
