@@ -20,13 +20,10 @@ Ints = npt.NDArray[np.int32]
 Single = npt.NDArray[np.float32]
 
 EDGE_M: Final = 0.25
-LEVELS: Final = 4
-"""Larger voxels: each level has twice the edge of the one before."""
 _FIRST: Final = (2, 1)
 _LAST: Final = (3, 4)
-"""Levels that are asked for a plane, in this order, before the voxel itself and its neighbours are, and after them."""
-_KEPT: Final = (2, 3, 4)
-"""Levels that free space and classes ask for."""
+"""Levels of larger voxels, each of twice the edge of the one before, that are asked for a plane, in this order: before the voxel itself and
+its neighbours are, and after them."""
 MOST: Final = 4_000_000
 """Voxels of a stretch of flight: some 600 MB."""
 _PIECE: Final = 1 << 19
@@ -95,22 +92,24 @@ class Surroundings(VoxelMap):
 
     def find_planes(self) -> None:
         """Find the plane of each voxel: all points are there."""
-        below, parent = self._larger(self, None)
-        levels = {1: Level(below, parent)}
-        for number in range(2, LEVELS + 1):
-            below, parent = self._larger(below, parent)
-            levels[number] = Level(below, parent)
-        for each in (self, *(level.cubes for level in levels.values())):
+        levels = {1: self._larger(self, None)}
+        levels[2] = self._larger(*levels[1])
+        for each in (self, levels[1].cubes, levels[2].cubes):
             _planes(each.voxels, each.used, each.edge_m)
         found = np.zeros((self.used, 3), np.float32)
         for number in _FIRST:
             self._take(levels[number], found)
+        del levels[1]  # nothing else asks for it, and the others take its memory
         self._take(Level(self, np.arange(self.used, dtype=np.int32)), found)
         self.voxels.normal[: self.used] = found
+        del found
         _borrow(self.table, self.voxels, self.used, self.edge_m)
         for number in _LAST:
+            levels[number] = self._larger(*levels[number - 1])
+            cubes = levels[number].cubes
+            _planes(cubes.voxels, cubes.used, cubes.edge_m)
             self._take(levels[number], self.voxels.normal[: self.used])
-        self.levels = {number: levels[number] for number in _KEPT}
+        self.levels = levels
 
     def incidence_deg(self, xyz_m: Array, origins_m: Array, voxel: Ints) -> Single:
         """Angle between beam and normal of each point, shape (n,); not-a-number without a plane."""
