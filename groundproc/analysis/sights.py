@@ -10,7 +10,7 @@ import pyproj
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis import voxelsight
-from groundproc.analysis.sighttask import VOXELS, Task, along
+from groundproc.analysis.sighttask import VOXELS, Task, accompanied, alone, along
 from groundproc.analysis.viewshed import EXACT, FAST, UNKNOWN, VISIBLE, Sight, bend_per_m, height_at, viewshed
 from groundproc.cloud import reader
 from groundproc.cloud.metres import METRES, Metres, Raster, flat, metres_in, metres_of, unstated
@@ -126,15 +126,20 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
     cell_m = checked_cell(task.cell_m or _CELL_M)
     crs = agreed_crs([cloud])
     cells = Cells(cell_m / unit.across, {"max"})
+    company, strays = accompanied(cloud, unit, cell_m, progress), 0
     for chunk in reader.chunks(cloud, columns=()):
-        cells.add(chunk.points.xyz_m, chunk.points.xyz_m[:, 2])
+        xyz = chunk.points.xyz_m
+        stray = company.alone(unit.of(xyz))
+        cells.add(xyz[~stray], xyz[~stray, 2])
+        strays += int(stray.sum())
         progress(len(chunk.points))
     grid = cells.grid()
     if grid is None:
-        raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
+        raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves, or are alone")
     _check_size(grid)
     heights = filled(cells.window(grid, "max"), max(round(_GAP_M / cell_m), 1))
-    return Surface(heights, grid.west_m, grid.north_m, grid, crs, unit, tuple(unstated(cloud)))
+    told = (*alone(task.source, strays), *unstated(cloud))
+    return Surface(heights, grid.west_m, grid.north_m, grid, crs, unit, told)
 
 
 def _check_size(grid: Grid) -> None:

@@ -1,5 +1,6 @@
 """What is asked of lines of sight, and the places along a path to look from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -9,6 +10,9 @@ import pyproj
 import shapely
 
 from flightlog.errors import UsageError
+from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
+from groundproc.cloud import reader
+from groundproc.cloud.metres import Metres
 from groundproc.vectors.features import read_features
 
 VOXELS: Final = "voxels"
@@ -55,6 +59,27 @@ class Task:
     curved: bool
     cell_m: float | None
     trajectory: Path | None = None
+
+
+def accompanied(cloud: reader.Cloud, metres: Metres, cell_m: float, progress: Callable[[int], object]) -> Lonely:
+    """Which points of a cloud are alone, as `swath ground` has it: a bird is no surface that one sees, or stands on.
+
+    Clouds that are looked at in larger cells are sparser, and so are their points.
+    """
+    found = Lonely(max(LEAST_SIDE_M, 2.0 * cell_m))
+    for chunk in reader.chunks(cloud, columns=()):
+        found.add(metres.of(chunk.points.xyz_m))
+        progress(len(chunk.points))
+    return found
+
+
+def alone(source: Path, strays: int) -> list[str]:
+    """What is said of points that were left out."""
+    return (
+        [f"{source}: {strays:,} points that are alone hide nothing, and nobody stands on them: birds, noise"]
+        if strays
+        else []
+    )
 
 
 def along(task: Task, crs: pyproj.CRS | None) -> list[tuple[float, float]]:

@@ -19,7 +19,8 @@ from numba import njit
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from flightlog.errors import CoverageError, UsageError
-from groundproc.analysis.sighttask import Task, along
+from groundproc.analysis.sighttask import Task, accompanied, alone, along
+from groundproc.analysis.terrain.lonely import Lonely
 from groundproc.cloud import reader
 from groundproc.cloud.metres import Metres, metres_of, unstated
 from groundproc.cloud.sameness import agreed_crs
@@ -54,12 +55,18 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
     crs, metres = agreed_crs([cloud]), metres_of(cloud)
     path = None if task.trajectory is None else sensorpath.flown([cloud], task.trajectory)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    company, strays = accompanied(cloud, metres, edge_m, progress), 0
     for chunk in reader.chunks(cloud, columns=()):
         xyz = metres.of(chunk.points.xyz_m)
+        stray = company.alone(xyz)
+        strays += int(stray.sum())
+        if stray.all():
+            continue
+        xyz = xyz[~stray]
         low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
         progress(len(chunk.points))
     if not np.isfinite(low).all():
-        raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves")
+        raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves, or are alone")
     first = np.floor(low / edge_m).astype(np.int64)
     shape = np.floor(high / edge_m).astype(np.int64) - first + 1
     if int(np.prod(shape)) > _MOST:
@@ -67,7 +74,7 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
             f"{task.source}: {shape[0]} x {shape[1]} x {shape[2]} voxels of {edge_m:g} m found, expected at most {_MOST:,}; choose a "
             "larger --cell, or cut out the part of interest with `swath section`"
         )
-    hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m), metres, progress)
+    hits, passes, ground = _met(task, cloud, path, (first, shape, edge_m, company), metres, progress)
     ground = _standing(ground, edge_m)
     through = _through(hits, passes)
     grid = Grid(int(first[0]), int(first[1]), int(shape[0]), int(shape[1]), edge_m / metres.across)
@@ -94,7 +101,8 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
     seen = np.isfinite(image)
     return {
         "mode": task.mode, "places": len(places), "cells": int(image.size), "unknown_cells": int((~seen).sum()),
-        "mean_transmittance": float(image[seen].mean()) if seen.any() else None, "warnings": unstated(cloud),
+        "mean_transmittance": float(image[seen].mean()) if seen.any() else None,
+        "warnings": [*alone(task.source, strays), *unstated(cloud)],
     }  # fmt: skip
 
 
@@ -102,12 +110,15 @@ def _met(
     task: Task,
     cloud: reader.Cloud,
     path: sensorpath.Flown | None,
-    voxels: tuple[Any, Any, float],
+    voxels: tuple[Any, Any, float, Lonely],
     metres: Metres,
     progress: Callable[[int], object],
 ) -> tuple[Any, Any, Array]:
-    """Beams that ended in each voxel and that went through, and the lowest point of each column; voxels by their first, shape and edge."""
-    first, shape, edge_m = voxels
+    """Beams that ended in each voxel and that went through, and the lowest point of each column.
+
+    Voxels are given by their first, shape and edge; points that are alone are left out.
+    """
+    first, shape, edge_m, company = voxels
     hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
     ground = np.full((shape[0], shape[1]), np.inf)
     tally = None if path is None or task.trajectory is None else sensorpath.Tally(task.trajectory, path, cloud)
@@ -122,8 +133,9 @@ def _met(
             if tally is not None:
                 tally.add(away * edge_m, known)
         last = np.asarray(chunk.record.return_number) >= np.asarray(chunk.record.number_of_returns)
-        _beams(local[known], away[known], last[known], hits, passes)
-        _lowest(local, xyz[:, 2], ground)
+        some = ~company.alone(xyz)
+        _beams(local[known & some], away[known & some], last[known & some], hits, passes)
+        _lowest(local[some], xyz[some, 2], ground)
         progress(len(chunk.points))
     if tally is not None:
         tally.check()

@@ -59,6 +59,12 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"swath: {each.sentence}", file=sys.stderr)
     if len(broken) > 20:
         print(f"swath: and {len(broken) - 20} more", file=sys.stderr)
+    if not found.judged.checks:
+        print(
+            "swath: no promise could be judged: expected a panel at --panels' place with echoes, of the brightness and distance that the "
+            "sheet promises for",
+            file=sys.stderr,
+        )
     print(f"{found.sensor}: {len(found.judged.checks) - len(broken)} of {len(found.judged.checks)} promises kept")
     return EXIT_CODES[found.judged.grade]
 

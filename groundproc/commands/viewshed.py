@@ -12,7 +12,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from groundproc.commands.outputs import add_force
 
     parser.add_argument(
-        "source", type=Path, metavar="DSM|CLOUD", help="a raster of heights (.tif), or LAS, LAZ or COPC"
+        "source",
+        type=Path,
+        metavar="DSM|CLOUD",
+        help="a raster of heights (.tif), or LAS, LAZ or COPC: the highest point of each cell, without those that are alone",
     )
     parser.add_argument("--at", metavar="E,N", help="place of the observer, in the CRS of the source")
     parser.add_argument(

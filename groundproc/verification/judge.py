@@ -49,8 +49,8 @@ class Judged:
 
     @property
     def grade(self) -> str:
-        """Of `groundproc.verdict`."""
-        return GOOD if all(each.meets for each in self.checks) else DOUBTFUL
+        """Of `groundproc.verdict`; of a sensor that nothing was held against nothing good is known."""
+        return GOOD if self.checks and all(each.meets for each in self.checks) else DOUBTFUL
 
     @property
     def broken(self) -> list[Check]:

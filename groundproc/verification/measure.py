@@ -74,6 +74,8 @@ class Measured:
         Of its plane from the sensor; NaN where it was not seen.
     rim, mixed : int
         Echoes of shots that meet its edge, and how many of them lie between it and what is behind.
+    elsewhere_m : float
+        Range at which most shots at it came back from something else; NaN where that is not so.
     """
 
     panel: Panel
@@ -82,6 +84,7 @@ class Measured:
     distance_m: float
     rim: int
     mixed: int
+    elsewhere_m: float = float("nan")
 
     @property
     def seen(self) -> bool:
@@ -160,7 +163,10 @@ def measure(panel: Panel, aimed: Aimed, ranging: Ranging) -> Measured:
     between = rim & (off > max(_ON_SIGMAS * scatter, _LEAST_OFF_M)) & (off < ranging.pulse_m)
     whole = _row(-1, aimed, off, shots, on)
     distance_m = plane.distance_m if whole.echoes >= FEWEST else float("nan")
-    return Measured(panel, whole, rows, distance_m, int(rim.sum()), int(between.sum()))
+    back = aimed.range_m[inside & ~aimed.second & ~on & np.isfinite(aimed.range_m)]
+    most = len(back) > 0.5 * (inside & ~aimed.second).sum()
+    elsewhere_m = float(np.median(back)) if most else float("nan")
+    return Measured(panel, whole, rows, distance_m, int(rim.sum()), int(between.sum()), elsewhere_m)
 
 
 def _row(laser: int, aimed: Aimed, off: Array, shots: npt.NDArray[np.bool_], on: npt.NDArray[np.bool_]) -> Row:

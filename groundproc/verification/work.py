@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flightlog.errors import CoverageError
 from groundproc.files import written_aside
 from groundproc.verification import plot
@@ -55,7 +57,7 @@ def verify(task: Task, progress: Callable[[int], None]) -> Verified:
         measure(panel, aimed, recording.lidar.ranging)
         for panel, aimed in zip(chosen.panels, recording.aimed, strict=True)
     ]
-    if not any(each.whole.shots for each in found):
+    if not any(each.whole.shots or np.isfinite(each.elsewhere_m) for each in found):
         raise CoverageError(
             f"{task.panels}: no shot of {task.logs[0]} goes where a panel is said to be; expected azimuth_deg clockwise from straight "
             "ahead and up_m above the sensor, in the sensor's frame"
@@ -63,7 +65,13 @@ def verify(task: Task, progress: Callable[[int], None]) -> Verified:
     warnings = [
         f"{each.panel.title}: no shot meets it: its place or size is wrong, or it lies between two lasers"
         for each in found
-        if not each.whole.shots
+        if not each.whole.shots and not np.isfinite(each.elsewhere_m)
+    ]
+    warnings += [
+        f"{each.panel.title}: most shots at it come back from {each.elsewhere_m:.1f} m; expected it at {each.panel.distance_m:g} m, up to "
+        "0.5 m off: its place is wrong, or something stands in front"
+        for each in found
+        if np.isfinite(each.elsewhere_m)
     ]
     if task.picture is not None:
         with written_aside(task.picture) as aside:

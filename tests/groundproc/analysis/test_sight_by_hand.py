@@ -194,6 +194,27 @@ def test_one_stands_on_the_ground_below_a_crown_and_on_a_roof(tmp_path: Path) ->
         assert np.nanmedian(value[row - 1 : row + 2, column - 1 : column + 2]) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("mode", ["exact", "fast", "voxels"])
+def test_birds_hide_nothing_and_a_post_does(tmp_path: Path, mode: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """On a plain; one bird is before the observer, one over him, and a post of twelve points stands to the north."""
+    x, y = np.meshgrid(np.arange(0.25, 40, 0.5), np.arange(0.25, 40, 0.5))
+    plain = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 700.2)])
+    post = np.column_stack([np.full(12, 20.25), np.full(12, 25.25), np.linspace(700.4, 704.0, 12)])
+    birds = np.array([[23.25, 20.25, 707.0], [20.25, 20.25, 712.0]])
+    xyz = np.concatenate([plain, post, birds])
+    cloud = write(tmp_path / "c.las", xyz, np.ones((len(xyz), 2), int), np.zeros(len(xyz)))
+    made = tmp_path / "o.tif"
+    words = ["viewshed", str(cloud), "--mode", mode, "--height", "1.7", "--at", f"{EAST + 20.25},{NORTH + 20.25}"]
+    assert main([*words, "--target-height", "1.7", "-o", str(made)]) == 0
+    assert "2 points that are alone" in capsys.readouterr().err
+    with rasterio.open(made) as raster:
+        value = raster.read(1, masked=True).filled(0)
+        east, north = (value[raster.index(EAST + x, NORTH + y)] for x, y in ((36.25, 20.25), (20.25, 36.25)))
+    assert east == pytest.approx(1.0)
+    if mode != "voxels":  # beams from above go past most of a post
+        assert north == 0.0
+
+
 @pytest.mark.parametrize("way", ["there", "back"])
 def test_a_path_over_a_surface_counts_the_places_that_see_a_cell(tmp_path: Path, way: str) -> None:
     rng = np.random.default_rng(8)

@@ -184,3 +184,16 @@ def test_bad_lists_of_panels_are_one_sentence(
     assert said in err
     assert "\n" not in err
     assert not (tmp_path / "j.json").exists()
+
+
+def test_a_panel_that_is_elsewhere_is_said_to_be_and_nothing_judged_is_no_pass(
+    still_flight: Any, panels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (wrong,) = (each for each in yaml.safe_load(panels.read_text())["panels"] if each["name"] == "panel_4.6 at 10 m")
+    wrong["distance_m"] += 2.0
+    (tmp_path / "p.yaml").write_text(yaml.safe_dump({"panels": [wrong]}))
+    assert main(["verify-sensor", str(still_flight.log), "--panels", str(tmp_path / "p.yaml")]) == 3
+    out = capsys.readouterr()
+    assert "panel_4.6 at 10 m: most shots at it come back from 5.0 m; expected it at 12 m" in out.err
+    assert "no promise could be judged" in out.err
+    assert "0 of 0 promises kept" in out.out
