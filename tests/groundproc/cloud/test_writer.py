@@ -71,9 +71,11 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     assert (cloud.header.version.major, cloud.header.version.minor) == (1, 4)
     assert cloud.header.point_format.id == 6
     assert cloud.header.point_count == 50_000
-    np.testing.assert_allclose(np.stack([cloud.x, cloud.y, cloud.z], axis=1), points.xyz_m, atol=0.0005 + 1e-9)
-    np.testing.assert_allclose(cloud.header.mins, points.xyz_m.min(axis=0), atol=0.001)
-    np.testing.assert_allclose(cloud.header.maxs, points.xyz_m.max(axis=0), atol=0.001)
+    np.testing.assert_allclose(
+        np.stack([cloud.x, cloud.y, cloud.z], axis=1), points.xyz_m, rtol=0.0, atol=0.0005 + 1e-9
+    )
+    np.testing.assert_allclose(cloud.header.mins, points.xyz_m.min(axis=0), rtol=0.0, atol=0.001)
+    np.testing.assert_allclose(cloud.header.maxs, points.xyz_m.max(axis=0), rtol=0.0, atol=0.001)
     # doubles of 4.6e8 s are 6e-8 s apart
     start_s = START_NS // 10**9 - 315_964_800 + 18 - 10**9
     np.testing.assert_allclose(cloud.gps_time - start_s, (points.time_ns - START_NS) * 1e-9, rtol=0, atol=1e-7)
