@@ -62,14 +62,17 @@ def strains(factors: Sequence[Factor], x: Array, coarse: Coarse, figures: Mappin
             most = int(min(seconds / SHORTEST_ROWS, coarse.nodes / 2))
             if seconds >= 2 and most >= 1:
                 strain = np.ones(3)
-                for axes in (HORIZONTAL, UPWARD):
-                    strain[list(axes)] = _strain(factor, x, coarse, axes, most)
+                for axes, weakened in ((HORIZONTAL, factor.weakened), (UPWARD, 1.0)):
+                    strain[list(axes)] = _strain(factor, x, coarse, axes, most, weakened)
                 found[factor.source] = np.maximum(strain, found.get(factor.source, 1.0))
     return found
 
 
-def _strain(factor: Factor, x: Array, coarse: Coarse, axes: Sequence[int], most: int) -> float:
-    """Of some axes together, by the slowest courses, so many an axis at most: the largest factor that the first of them give."""
+def _strain(factor: Factor, x: Array, coarse: Coarse, axes: Sequence[int], most: int, weakened: float) -> float:
+    """Of some axes together, by the slowest courses, so many an axis at most: the largest factor that the first of them give.
+
+    Rows that are `weakened` because of what changes fast are judged by what is stated: what changes slowly may well be of that size.
+    """
     left = (factor.residual + factor.matrix @ x) / factor.sigma
     courses = slow_courses(len(left) // 3, most)
     whitened = sparse.diags(1.0 / factor.sigma) @ factor.matrix
@@ -79,7 +82,7 @@ def _strain(factor: Factor, x: Array, coarse: Coarse, axes: Sequence[int], most:
         spread[axis::3, i :: len(axes)] = courses
     seen = whitened.T @ spread
     shown = np.eye(spread.shape[1]) - seen.T @ coarse.solve(seen)
-    return float(np.sqrt(variance_factor(spread.T @ left, shown, len(axes))))
+    return float(np.sqrt(variance_factor(weakened * (spread.T @ left), shown, len(axes))))
 
 
 def slow_courses(count: int, most: int) -> Array:
@@ -101,8 +104,9 @@ def variance_factor(left: Array, shown: Array, step: int) -> float:
 
 
 def of_source(strain: Mapping[str, Array], factor: Factor) -> Array:
-    """Factors of the rows of a factor, shape (rows,)."""
+    """Times that the errors of a factor's rows are larger than these take them to be, shape (rows,)."""
     known = strain.get(factor.source)
     if known is None:
         return np.ones(len(factor.residual))
-    return np.tile(known, len(factor.residual) // len(known))
+    beyond = np.maximum(known / np.array([factor.weakened, factor.weakened, 1.0]), 1.0)
+    return np.asarray(np.tile(beyond, len(factor.residual) // len(known)))

@@ -324,6 +324,7 @@ def position_factors(
         sigma=course.sigma * np.tile([left.strain, left.strain, 1.0], count),
         source=fixes_name(number),
         course=True,
+        weakened=left.strain,
     )
     # a receiver that jumps, or is led astray by a wall, goes where no vehicle does: its steps lose weight
     course = replace(course, sigma=course.sigma / np.sqrt(huber(np.abs(course.residual) / course.sigma, STEP_SIGMAS)))

@@ -166,6 +166,8 @@ class Factor:
         Whose errors these are, where residuals judge how large they are stated: rows are three to a second, east, north, up.
     course : bool
         Whether rows are the whitened changes of such errors.
+    weakened : float
+        How many times larger than stated, east and north, the rows of a course take errors to be already.
     """
 
     name: str
@@ -177,6 +179,7 @@ class Factor:
     carrying: Carrying | None = None
     source: str = ""
     course: bool = False
+    weakened: float = 1.0
 
     def rms(self) -> float:
         """Root mean square of the residuals in sigmas."""

@@ -28,13 +28,16 @@ def receiver(rng: np.random.Generator, times: Array) -> Array:
     return np.asarray(np.stack(made, axis=1) * SIGMA_M * times)
 
 
-def judged(error_m: Array, loose: tuple[bool, bool, bool]) -> Array:
+def judged(error_m: Array, loose: tuple[bool, bool, bool], weakened: float = 1.0) -> Array:
     """Factors of a receiver with these errors; along the axes that are `loose` nothing but its fixes holds the path."""
     unknowns = 3 * SECONDS + 6
     matrix = sparse.hstack([sparse.eye(3 * SECONDS), sparse.csr_matrix((3 * SECONDS, 6))], format="csr")
     time_s = np.arange(float(SECONDS))
     made = whitened("position", -error_m, matrix, time_s, np.tile(SIGMA_M, (SECONDS, 1)), TAU_S, 0.01, Errors.ANCHOR)
-    course = Factor(made.name, made.residual, made.matrix, made.sigma, errors=made.errors, source="fixes", course=True)
+    sigma = made.sigma * np.tile([weakened, weakened, 1.0], SECONDS)
+    course = Factor(
+        made.name, made.residual, made.matrix, sigma, errors=made.errors, source="fixes", course=True, weakened=weakened
+    )
     held_m = np.concatenate([np.tile(np.where(loose, 100.0, 0.01), SECONDS), np.ones(6)])
     by_row = sparse.diags(1.0 / course.sigma) @ course.matrix
     normal = (by_row.T @ by_row).toarray() + np.diag(held_m**-2.0)
@@ -71,6 +74,17 @@ def test_errors_that_the_path_follows_show_nothing() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         assert (judged(receiver(rng, np.full(3, 5.0)), (True, True, True)) == 1.0).all()
+
+
+def test_rows_that_are_weakened_already_are_judged_by_what_is_stated() -> None:
+    """Three times worse, and the weights of the course know of two of these three: the mean errs by all of it, the course by the rest."""
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        error_m = receiver(rng, np.array([3.0, 3.0, 1.0]))
+        found = judged(error_m, (False, False, False))
+        np.testing.assert_allclose(judged(error_m, (False, False, False), weakened=2.0), found, rtol=0.01)
+    course = Factor("position", np.zeros(6), sparse.eye(6, format="csr"), np.ones(6), source="fixes", weakened=2.0)
+    np.testing.assert_array_equal(of_source({"fixes": np.array([3.0, 1.5, 1.2])}, course), [1.5, 1.0, 1.2] * 2)
 
 
 def test_a_walk_of_metres_shows() -> None:
