@@ -69,7 +69,7 @@ def verify(task: Task, progress: Callable[[int], None]) -> Verified:
     ]
     warnings += [
         f"{each.panel.title}: most shots at it come back from {each.elsewhere_m:.1f} m; expected it at {each.panel.distance_m:g} m, up to "
-        "0.5 m off: its place is wrong, or something stands in front"
+        f"0.5 m off: its place is wrong{', or something stands in front' if each.elsewhere_m < each.panel.distance_m else ''}"
         for each in found
         if np.isfinite(each.elsewhere_m)
     ]
