@@ -17,6 +17,8 @@ _GAP_M: Final = 5.0
 _OFF_M: Final = 0.08
 _LEAN: Final = 0.035
 """How far points are off each other's lines: noise, and what the direction errs by, along the way between them."""
+_OVER_M: Final = 0.3
+"""Wires so far above the top of a pole go on over it: it is a lamp post."""
 _TURN: Final = float(np.cos(np.deg2rad(9.0)))
 
 
@@ -70,6 +72,7 @@ def _unsupported(xyz_m: Array, a: Ints, b: Ints, poles: Sequence[Pole]) -> tuple
         to = place - xyz_m[a[some], :2]
         along, off = np.sum(to * way, axis=1), np.abs(to[:, 0] * way[:, 1] - to[:, 1] * way[:, 0])
         keep = np.ones(len(a), np.bool_)
-        keep[some[(along > 0.0) & (along < length) & (off < reach)]] = False
+        under = np.minimum(xyz_m[a[some], 2], xyz_m[b[some], 2]) < pole.foot_m + pole.height_m + _OVER_M
+        keep[some[(along > 0.0) & (along < length) & (off < reach) & under]] = False
         a, b = a[keep], b[keep]
     return a, b

@@ -32,6 +32,8 @@ _GROWTHS: Final = 6
 _SHARP: Final = 0.14
 """Angle [rad] at which points of 3 cm tell the place of a bend better than a pole does."""
 _BEYOND_M: Final = 3.0
+_TELLING: Final = 0.03
+"""Angle [rad] at which the bend tells one pole from another some metres away."""
 _ON_POLE_M: Final = 0.3
 """A wire that runs so near to the axis of a pole hangs on it, and not where it crosses another one."""
 _RIVAL_M: Final = 3.0
@@ -61,7 +63,7 @@ class _Meeting(NamedTuple):
 
 
 class _Bearer(NamedTuple):
-    """A pole that may bear an end: how far along the wire it is from the last point, its number, its place along the wire and beside it."""
+    """A pole that may bear an end: how far it is along the wire from about where it hangs, its number, its place along it and beside it."""
 
     away_m: float
     number: int
@@ -251,11 +253,15 @@ def _sound(wire: Catenary, points_m: Array) -> bool:
 def attached(wires: Sequence[Catenary], poles: Sequence[Pole]) -> list[Catenary]:
     """Wires as far as where they hang: at a pole beside the end, or where the next span's curve meets its own."""
     ends = [(wire, end, sign) for wire in wires for end, sign in ((wire.start_m, -1.0), (wire.end_m, 1.0))]
-    beside = [_beside(wire, end, poles) for wire, end, _ in ends]
+    meetings = [_at_wire(wire, end, sign, wires) for wire, end, sign in ends]
+    beside = [
+        _beside(wire, end, poles, end if met is None or met.turn < _TELLING else met.s_m)
+        for (wire, end, _), met in zip(ends, meetings, strict=True)
+    ]
     carried = Counter(min(each).number for each in beside if each)
     found = []
-    for (wire, end, sign), each in zip(ends, beside, strict=True):
-        met, pole = _at_wire(wire, end, sign, wires), _support(each, carried)
+    for (_, end, _), met, each in zip(ends, meetings, beside, strict=True):
+        pole = _support(each, carried)
         # at a bend the arms lean, and wires do not end where the pole is
         sharp = met is not None and met.turn > _SHARP and met.beyond_m < _BEYOND_M
         arm = pole is None or pole.aside_m > _ON_POLE_M
@@ -274,14 +280,14 @@ def _reach_m(wire: Catenary) -> float:
     return 3.0 + 0.12 * wire.length_m
 
 
-def _beside(wire: Catenary, end: float, poles: Sequence[Pole]) -> list[_Bearer]:
-    """Poles that may bear an end."""
+def _beside(wire: Catenary, end: float, poles: Sequence[Pole], about: float) -> list[_Bearer]:
+    """Poles that may bear an end, of which it is known about where it hangs."""
     found = []
     for number, pole in enumerate(poles):
         s, off, up = wire.local(np.array([[pole.x, pole.y, pole.foot_m]]))
-        away, high = abs(float(s[0]) - end), -float(up[0])
-        if abs(off[0]) <= pole.arm_m and away < _reach_m(wire) and high < pole.height_m + 2.5:
-            found.append(_Bearer(away, number, float(s[0]), abs(float(off[0]))))
+        high = -float(up[0])
+        if abs(off[0]) <= pole.arm_m and abs(s[0] - end) < _reach_m(wire) and high < pole.height_m + 2.5:
+            found.append(_Bearer(abs(float(s[0]) - about), number, float(s[0]), abs(float(off[0]))))
     return found
 
 
