@@ -181,7 +181,7 @@ def test_clock_and_lasers_are_those_of_the_folder(thin: Path, direct: Path, plac
     # all but the shots at the ends of the trajectory are in both clouds; stamps are right to 0.1 us
     both = max(new_s[0], old_s[0]) - 1e-6, min(new_s[-1], old_s[-1]) + 1e-6
     new, old = ((stamps > both[0]) & (stamps < both[1]) for stamps in (new_s, old_s))
-    np.testing.assert_allclose(new_s[new], old_s[old], atol=1e-6)
+    np.testing.assert_allclose(new_s[new], old_s[old], rtol=0, atol=1e-6)
     assert new.mean() > 0.99
     moved = np.linalg.norm(points(late)[new] - points(placed)[old], axis=1)
     # in 20 ms the aircraft flies 0.1 m and turns by a few tenths of a degree
@@ -196,9 +196,9 @@ def test_the_sigmas_are_the_roots_of_the_written_covariances(direct: Path) -> No
     assert (table["utc_ns"][rows] == time_ns).all()
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for column, name in enumerate(("east", "north", "up")):
-        np.testing.assert_allclose(sigma[:, column], table[f"sigma_{name}_m"][rows], atol=6e-5)
+        np.testing.assert_allclose(sigma[:, column], table[f"sigma_{name}_m"][rows], rtol=0, atol=6e-5)
     for column, name in enumerate(("roll", "pitch", "heading"), 3):
-        np.testing.assert_allclose(np.rad2deg(sigma[:, column]), table[f"sigma_{name}_deg"][rows], atol=6e-5)
+        np.testing.assert_allclose(np.rad2deg(sigma[:, column]), table[f"sigma_{name}_deg"][rows], rtol=0, atol=6e-5)
     assert np.diff(time_ns).max() == 100_000_000
     assert np.linalg.eigvalsh(covariance / (sigma[:, :, None] * sigma[:, None, :])).min() > -1e-9
 

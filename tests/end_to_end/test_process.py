@@ -302,7 +302,7 @@ def test_a_flight_recorded_as_the_original_was_gives_the_same_cloud(
     assert np.abs(np.asarray(ours.gps_time) - np.asarray(theirs.gps_time)).max() < 1e-6
     for name in ("intensity", "laser", "range"):
         assert (np.asarray(ours[name]) == np.asarray(theirs[name])).all()
-    np.testing.assert_allclose(points_of(ours), points_of(theirs), atol=0.0011)
+    np.testing.assert_allclose(points_of(ours), points_of(theirs), rtol=0, atol=0.0011)
     assert made.quality["mount"]["source"] == "firmware_config/mount.yaml"
 
 
@@ -314,7 +314,7 @@ def test_two_parts_of_a_flight_give_the_cloud_of_the_whole(gps_flight: Any, flow
     made = process(tmp_path / "out", second, first)
     assert len(made.quality["inputs"]) == 2
     assert made.cloud.header.point_count == flown.cloud.header.point_count
-    np.testing.assert_allclose(points_of(made.cloud), points_of(flown.cloud), atol=0.0011)
+    np.testing.assert_allclose(points_of(made.cloud), points_of(flown.cloud), rtol=0, atol=0.0011)
 
 
 # Options --------------------------------------------------------------------------------------------------------------
@@ -326,10 +326,13 @@ def test_heights_are_of_the_kind_asked_for(short: Processed, short_log: Path, gp
     relative = process(tmp_path / "relative", short_log, "--sync", "host", "--height", "relative")
     # home of the simulation lies 61.3 m above the sea
     np.testing.assert_allclose(
-        points_of(relative.cloud)[:, 2] + gps_flight.truth["local_origin"]["height_msl_m"], sea[:, 2], atol=0.004
+        points_of(relative.cloud)[:, 2] + gps_flight.truth["local_origin"]["height_msl_m"],
+        sea[:, 2],
+        rtol=0,
+        atol=0.004,
     )
     above = process(tmp_path / "ellipsoid", short_log, "--sync", "host", "--height", "ellipsoid", "--geoid", "29.354")
-    np.testing.assert_allclose(points_of(above.cloud)[:, 2] - 29.354, sea[:, 2], atol=0.004)
+    np.testing.assert_allclose(points_of(above.cloud)[:, 2] - 29.354, sea[:, 2], rtol=0, atol=0.004)
     for made, said in ((relative, "home"), (above, "ellipsoid")):
         assert said in made.quality["height"]["meaning"]
         crs = made.cloud.header.parse_crs()
@@ -346,7 +349,7 @@ def test_another_crs_moves_the_coordinates_and_nothing_else(short: Processed, sh
     expected = np.stack(
         pyproj.Transformer.from_crs(32633, 3009, always_xy=True).transform(utm[:, 0], utm[:, 1]), axis=1
     )
-    np.testing.assert_allclose(sweref[:, :2], expected, atol=0.0015)  # two roundings to a millimetre
+    np.testing.assert_allclose(sweref[:, :2], expected, rtol=0, atol=0.0015)  # two roundings to a millimetre
     assert (sweref[:, 2] == utm[:, 2]).all()
 
 

@@ -85,7 +85,7 @@ def test_temperatures_are_those_of_the_raster_on_what_is_uppermost(
     ]
     assert main([*words, "--json", str(tmp_path / "f.json")]) == 0
     out = laspy.read(tmp_path / "o.laz")
-    assert np.allclose(out.xyz, xyz + np.array([*ORIGIN, 0.0]), atol=0.001)
+    assert np.allclose(out.xyz, xyz + np.array([*ORIGIN, 0.0]), rtol=0, atol=0.001)
     found = np.asarray(out["temperature"])
     inside = (np.abs(xyz[:, 0] - 20) < 4.4) & (np.abs(xyz[:, 1] - 20) < 4.4)
     hidden = inside & (xyz[:, 2] < 1.0)
@@ -144,7 +144,7 @@ def test_the_angle_is_blind_to_brightness_and_wavelengths_are_read() -> None:
     library = Library(("a", "b"), np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0]]))
     best, angle = library.nearest(np.array([[0.1, 0.2, 0.3], [30.0, 20.0, 10.0], [0.0, 0.0, 0.0], [np.nan, 1.0, 1.0]]))
     assert best.tolist() == [0, 1, -1, -1]
-    assert np.allclose(angle[:2], 0.0, atol=1e-6)
+    assert np.allclose(angle[:2], 0.0, rtol=0, atol=1e-6)
     assert np.isnan(angle[2:]).all()
     found = wavelengths(["Band 1 (450.5 nm)", "0.55 Micrometers", "700"])
     assert found is not None

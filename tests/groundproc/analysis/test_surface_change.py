@@ -30,8 +30,10 @@ def test_distances_and_detection_are_those_of_py4dgeo(tmp_path: Path, monkeypatc
     found = m3c2.distances(places, normal, (m3c2.bins(PAIR.a, 0.3, 1.5), m3c2.bins(PAIR.b, 0.3, 1.5)), 0.3, 1.5)
     both_seen = found.seen & np.isfinite(distance)
     assert both_seen.mean() > 0.9
-    np.testing.assert_allclose(found.distance_m[both_seen], distance[both_seen], atol=1e-9)
-    np.testing.assert_allclose(m3c2.detectable(found.own_m2)[both_seen], unsure["lodetection"][both_seen], atol=1e-9)
+    np.testing.assert_allclose(found.distance_m[both_seen], distance[both_seen], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        m3c2.detectable(found.own_m2)[both_seen], unsure["lodetection"][both_seen], rtol=0, atol=1e-9
+    )
 
 
 def test_recorded_epochs_of_py4dgeo_give_their_shift_along_the_normals(recordings: Path) -> None:

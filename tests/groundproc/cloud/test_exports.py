@@ -97,7 +97,7 @@ def test_csv_has_a_header_and_digits_enough(tmp_path: Path) -> None:
     rows = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True)
     np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(rows["classification"], source.classification)
-    np.testing.assert_allclose(rows["gps_time"], source.gps_time, atol=1e-9)
+    np.testing.assert_allclose(rows["gps_time"], source.gps_time, rtol=0, atol=1e-9)
 
 
 def test_a_crowd_that_no_node_can_take_is_refused_with_file_and_place(

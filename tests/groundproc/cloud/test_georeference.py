@@ -107,7 +107,7 @@ def test_every_point_is_where_the_sources_equation_puts_it(
     heading, pitch, roll = attitude
     on_airframe = sensor_xyz(packets, times, shots) @ by_the_source(*mount) + np.array(lever)
     expected = on_airframe @ by_the_source(-heading, pitch, roll) + np.array(position)
-    np.testing.assert_allclose(points.xyz_m, expected, atol=2e-5)  # xyz_m as float32: 4e-6 m an axis at 100 m
+    np.testing.assert_allclose(points.xyz_m, expected, rtol=0, atol=2e-5)  # xyz_m as float32: 4e-6 m an axis at 100 m
     assert (points.time_ns == shots.time_ns).all()
     for name in ("intensity", "laser"):
         assert (points[name] == getattr(shots, name)).all()
@@ -164,7 +164,7 @@ def test_level_ground_is_level_in_every_attitude(heading_deg: float, pitch_deg: 
     )
     assert len(points) > 10_000
     # half a range step, and the difference between the median step (18 or 19) and 18.4 over a firing, under 67 m of range
-    np.testing.assert_allclose(points.xyz_m[:, 2], 100.0, atol=0.001 + np.deg2rad(0.006) * 67.0)
+    np.testing.assert_allclose(points.xyz_m[:, 2], 100.0, rtol=0, atol=0.001 + np.deg2rad(0.006) * 67.0)
     # forward is where the heading points: tilted forward, the lidar sees more ground ahead
     ahead = (points.xyz_m[:, :2] - [3.0, 4.0]) @ [np.sin(np.deg2rad(heading_deg)), np.cos(np.deg2rad(heading_deg))]
     assert ahead.mean() > 1.0 or pitch_deg > 0
@@ -193,7 +193,7 @@ def test_each_shot_has_the_pose_of_its_own_instant() -> None:
     on_airframe = tilt.apply(sensor_xyz(packets, times, shots)) + np.array([0.0, 0.0, -0.16])
     expected = (base * Rotation.from_rotvec(own_s[:, None] * spin)).apply(on_airframe) + own_s[:, None] * speed
     # chord of 0.5 ms at 100 deg/s: (8.7e-4 rad)^2 / 8 of 100 m is 1e-5 m; xyz_m as float32: 8e-6 m; the trajectory's spline: 2e-6 m
-    np.testing.assert_allclose(points.xyz_m, expected, atol=2e-5)
+    np.testing.assert_allclose(points.xyz_m, expected, rtol=0, atol=2e-5)
 
 
 def test_a_held_pose_grid_gives_each_shot_the_nearest_pose() -> None:
@@ -212,7 +212,7 @@ def test_a_held_pose_grid_gives_each_shot_the_nearest_pose() -> None:
     moved = georeference(shots, held, Mount()).xyz_m - georeference(shots, resting, Mount()).xyz_m
     late = shots.time_ns - knots[0]
     nearest = -(-(late - 5_000_000) // 10_000_000)  # halfway between two poses the earlier one holds
-    np.testing.assert_allclose(moved[:, 0], nearest, atol=1e-5)
+    np.testing.assert_allclose(moved[:, 0], nearest, rtol=0, atol=1e-5)
 
 
 def test_what_makes_no_point_is_counted_by_its_first_reason() -> None:
@@ -252,8 +252,8 @@ def test_two_returns_of_a_pair_lie_on_one_line_from_the_lidar(data_payload: Call
     lidar = where + Rotation.from_euler("ZXY", [-1.0, 0.2, -0.1]).apply([0.0, 0.0, -0.16])
     near, far = points.xyz_m[::2] - lidar, points.xyz_m[1::2] - lidar
     # xyz_m as float32 at 9 m: 5e-7 m an axis
-    np.testing.assert_allclose(far, near * 1.5, atol=2e-6)
-    np.testing.assert_allclose(np.linalg.norm(near, axis=1), 6.0, atol=2e-6)
+    np.testing.assert_allclose(far, near * 1.5, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(np.linalg.norm(near, axis=1), 6.0, rtol=0, atol=2e-6)
 
 
 def test_projecting_in_place_is_what_the_polynomial_says() -> None:
@@ -262,4 +262,4 @@ def test_projecting_in_place_is_what_the_polynomial_says() -> None:
     local = rng.uniform([-150, -150, -10], [150, 150, 30], (5000, 3))
     projected = local.copy()
     project(projected, projection.polynomial(local.min(axis=0), local.max(axis=0)))
-    np.testing.assert_allclose(projected, projection.exact(local), atol=1e-4)
+    np.testing.assert_allclose(projected, projection.exact(local), rtol=0, atol=1e-4)

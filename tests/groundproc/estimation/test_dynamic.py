@@ -63,7 +63,7 @@ def test_a_pixel_has_the_mean_height_of_its_points() -> None:
     expected = binned_statistic_2d(
         points[inside, 1], points[inside, 0], points[inside, 2], "mean", bins=[edges, edges]
     ).statistic
-    np.testing.assert_allclose(model_of(points).model(), expected, atol=1e-5)
+    np.testing.assert_allclose(model_of(points).model(), expected, rtol=0, atol=1e-5)
 
 
 def filled_by_hand(measured: Array, fill: int) -> Array:
@@ -88,7 +88,7 @@ def filled_by_hand(measured: Array, fill: int) -> Array:
 def test_gaps_are_filled_over_so_many_pixels_and_no_more(fill: int) -> None:
     points = np.random.default_rng(2).uniform(-2, 2, (900, 3))
     measured = model_of(points).model()
-    np.testing.assert_allclose(model_of(points, fill).model(), filled_by_hand(measured, fill), atol=1e-5)
+    np.testing.assert_allclose(model_of(points, fill).model(), filled_by_hand(measured, fill), rtol=0, atol=1e-5)
 
 
 def test_the_difference_is_over_the_pixels_that_both_have() -> None:
@@ -124,7 +124,7 @@ def test_distances_in_plan_are_those_of_scipy() -> None:
     plan.occupy(found, points, np.zeros_like(points), LEVEL, NOWHERE)
     plan.spread(found)
     exact = distance_transform_edt(found.state == 0) * PIXEL_M
-    np.testing.assert_allclose(found.distance_m, np.where(exact < 0.3 - 1e-6, exact, 0.3), atol=1e-5)
+    np.testing.assert_allclose(found.distance_m, np.where(exact < 0.3 - 1e-6, exact, 0.3), rtol=0, atol=1e-5)
     plan.clear(found)
     assert not found.state.any()
     assert (found.distance_m == np.float32(0.3)).all()
@@ -160,7 +160,7 @@ def test_trims_turn_a_revolution_as_the_sources_third_step_says() -> None:
 
     turned = world(*angles).astype(np.float32)
     revolution = Revolution(0, np.zeros(3), angles, turned, np.zeros_like(turned))
-    np.testing.assert_allclose(turned @ revolution.turn(trims).T, world(*(angles + trims)), atol=1e-5)
+    np.testing.assert_allclose(turned @ revolution.turn(trims).T, world(*(angles + trims)), rtol=0, atol=1e-5)
 
 
 def test_splines_are_scipys_and_hold_at_the_ends() -> None:
@@ -169,7 +169,9 @@ def test_splines_are_scipys_and_hold_at_the_ends() -> None:
     asked = np.arange(-500_000_000, 3_500_000_000, 10_000_000)
     found = interpolated(time_ns, values, asked, 100.0)
     inside = (asked >= 0) & (asked <= time_ns[-1])
-    np.testing.assert_allclose(found[inside], CubicSpline(time_ns * 1e-9, values)(asked[inside] * 1e-9), atol=1e-9)
+    np.testing.assert_allclose(
+        found[inside], CubicSpline(time_ns * 1e-9, values)(asked[inside] * 1e-9), rtol=0, atol=1e-9
+    )
     np.testing.assert_allclose(found[asked < 0], np.tile(values[0], (50, 1)))
     np.testing.assert_allclose(found[-1], values[-1])
 
@@ -193,9 +195,9 @@ def test_applied_trims_are_in_the_angles_and_the_position() -> None:
     trims = np.tile([0.1, 0.5, 0.02, -0.03, 0.2, -0.3], (len(trajectory), 1))
     made = applied(trajectory, trims)
     heading, pitch, roll = frames.attitude_of(frames.mat_from_quat(made.quat_local_ins_wxyz))
-    np.testing.assert_allclose([heading[5], pitch[5], roll[5]], [0.1, 0.02, -0.03], atol=1e-9)
+    np.testing.assert_allclose([heading[5], pitch[5], roll[5]], [0.1, 0.02, -0.03], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
-        made.position_m - trajectory.position_m, np.tile([0.2, -0.3, 0.5], (len(made), 1)), atol=1e-9
+        made.position_m - trajectory.position_m, np.tile([0.2, -0.3, 0.5], (len(made), 1)), rtol=0, atol=1e-9
     )
 
 
@@ -308,7 +310,7 @@ def test_course_less_heading_is_the_trim_and_unknown_where_slow_or_silent() -> N
     course = Course(time_ns, np.deg2rad([350.0, 350, 370, 370, 370]), np.array([5.0, 5, 5, 5, 0.5]))
     asked = np.array([500_000_000, 1_500_000_000, 5_000_000_000, 8_500_000_000])
     found = np.rad2deg(course.trim_rad(asked, np.deg2rad([355.0, 5.0, 5.0, 5.0]), 2.0))
-    np.testing.assert_allclose(found[:2], [-5.0, -5.0], atol=1e-9)
+    np.testing.assert_allclose(found[:2], [-5.0, -5.0], rtol=0, atol=1e-9)
     assert np.isnan(found[2:]).all()
     said = compare(np.deg2rad([-4.0, -4.5, 0, 0]), np.deg2rad(found))
     assert said["share"] == 0.5
@@ -396,8 +398,8 @@ def test_trims_are_read_as_they_were_written(tmp_path: Path) -> None:
     write_trims(path, Trims(time_ns, heading, values, np.full(5, np.nan), found).figures())
     stamps, compass, yaw = read_yaw(path)
     np.testing.assert_array_equal(stamps, time_ns)
-    np.testing.assert_allclose(compass, heading, atol=1e-5)
-    np.testing.assert_allclose(yaw, values[:, 0], atol=1e-5)
+    np.testing.assert_allclose(compass, heading, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(yaw, values[:, 0], rtol=0, atol=1e-5)
     path.write_text("utc_ns,heading_deg,yaw_deg\n1,2\n")
     with pytest.raises(LogError, match="2 values found for 3 columns"):
         read_yaw(path)
@@ -418,7 +420,7 @@ def test_an_error_over_the_true_heading_becomes_a_trim_over_the_compass_heading(
     curve = curve_of_errors(ERROR, np.zeros((5, 5)), 0.0, 1, np.ones(BINS, np.bool_))
     true = np.linspace(0, 2 * np.pi, 100)
     stated = true + error_rad(ERROR, true)
-    np.testing.assert_allclose(stated + curve.trim_rad(stated), true, atol=np.deg2rad(0.05))
+    np.testing.assert_allclose(stated + curve.trim_rad(stated), true, rtol=0, atol=np.deg2rad(0.05))
     assert curve.seen == 1.0
     assert np.rad2deg(curve.sigma_rad(true)) == pytest.approx(0.1)
 

@@ -178,7 +178,7 @@ def test_the_adjoint_keeps_its_digits_over_a_measurement_far_better_than_what_wa
     true = left.T @ exact(after) @ left + np.outer(exact(row), exact(row)) / Fraction(spread)
     off = (exact(found) - true).astype(np.float64)
     assert np.array_equal(found, found.T)
-    np.testing.assert_allclose(off, 0.0, atol=1e-15 * np.abs(after).max())
+    np.testing.assert_allclose(off, 0.0, rtol=0, atol=1e-15 * np.abs(after).max())
     # a tenth of what is sought of the position east
     assert abs(off[0, 0]) * known[0, 0] ** 2 < 1e-5
 
@@ -189,7 +189,7 @@ def test_forward_and_backward_transitions_are_each_others_transposes() -> None:
     forward, backward = np.eye(STATES), np.eye(STATES)
     forward_rows(forward, 0.3, couple, keep)
     backward_rows(backward, 0.3, couple, keep)
-    np.testing.assert_allclose(backward, forward.T, atol=1e-14)
+    np.testing.assert_allclose(backward, forward.T, rtol=0, atol=1e-14)
 
 
 def test_the_start_knows_nothing_of_position_and_heading() -> None:
@@ -206,7 +206,9 @@ def test_normal_gravity_and_standard_atmosphere() -> None:
     assert normal_gravity(90.0, 0.0) == pytest.approx(9.8321849379, abs=1e-8)
     assert normal_gravity(45.0, 1000.0) == pytest.approx(9.806199 - 0.003086, abs=2e-5)
     # ICAO standard atmosphere (Doc 7488): 1000 m and 3000 m
-    np.testing.assert_allclose(pressure_height(np.array([1013.25, 898.746, 701.085])), [0.0, 1000.0, 3000.0], atol=0.5)
+    np.testing.assert_allclose(
+        pressure_height(np.array([1013.25, 898.746, 701.085])), [0.0, 1000.0, 3000.0], rtol=0, atol=0.5
+    )
 
 
 class TestTwoImus:
@@ -236,7 +238,7 @@ class TestTwoImus:
         signal = imu.combine(nodes_s, slow, fast, prior, 0.03)
         assert signal is not None
         assert signal.alignment is not None
-        np.testing.assert_allclose(signal.alignment.matrix, self.MATRIX @ np.diag([1.0, 1.0, sign]), atol=3e-3)
+        np.testing.assert_allclose(signal.alignment.matrix, self.MATRIX @ np.diag([1.0, 1.0, sign]), rtol=0, atol=3e-3)
         error = signal.mean - self.rates(nodes_s[:-1] + 0.0025)
         # what the integral gathers in ten seconds is what the stated density allows
         gathered = np.diff(np.cumsum(error - error.mean(axis=0), axis=0)[::2000] * 0.005, axis=0)
@@ -275,7 +277,7 @@ class TestTwoImus:
         assert signal is not None
         assert signal.alignment is not None
         # noise of the slow one over the motion, in as many samples: 0.6 / 0.3 / sqrt(6000)
-        np.testing.assert_allclose(signal.alignment.matrix, self.MATRIX, atol=3 * 0.026)
+        np.testing.assert_allclose(signal.alignment.matrix, self.MATRIX, rtol=0, atol=3 * 0.026)
         # the lidar's noise is 1/32 of the other's over twice as many samples
         assert signal.share < 0.3
         # samples 1.3 to 8.7 ms apart stand for 5.9 ms on average; between them the vibration is not quite met

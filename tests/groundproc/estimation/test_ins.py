@@ -178,9 +178,9 @@ def test_a_log_with_a_gps_and_no_filter_is_flown_by_the_gps(frames_of: FramesOf)
     fixes += [gps(1000 + 200 * i, 58.394 + step_deg * i, 15.574, 70.0 + 0.1 * i) for i in range(40)]
     made = fly(hover(frames_of, fixes))
     at = made.at(np.array([2 * S + 123 * MS, 6 * S]))
-    np.testing.assert_allclose(at.position_m[:, 1], [11.23, 50.0], atol=0.05)
-    np.testing.assert_allclose(at.position_m[:, 2], [0.56, 2.5], atol=0.01)
-    np.testing.assert_allclose(made.velocity_m_s[100:-100, 1], 10.0, atol=0.1)
+    np.testing.assert_allclose(at.position_m[:, 1], [11.23, 50.0], rtol=0, atol=0.05)
+    np.testing.assert_allclose(at.position_m[:, 2], [0.56, 2.5], rtol=0, atol=0.01)
+    np.testing.assert_allclose(made.velocity_m_s[100:-100, 1], 10.0, rtol=0, atol=0.1)
     with pytest.raises(LogError, match="no height above home"):
         fly(hover(frames_of, fixes), "relative")
     with pytest.raises(LogError, match="3D fix"):
@@ -266,7 +266,7 @@ def test_the_sources_grid_is_linear_to_10_ms_and_held(frames_of: FramesOf) -> No
     assert (made.time_ns % (10 * MS) == 0).all()
     fixes = ownsolution.position_fixes(boot, "msl")
     expected = np.interp(made.time_ns, fixes.time_ns, fixes.height_m) - made.frame.height_m
-    np.testing.assert_allclose(made.position_m[:, 2], expected, atol=1e-5)
+    np.testing.assert_allclose(made.position_m[:, 2], expected, rtol=0, atol=1e-5)
     smooth = fly(boot)
     middle = np.array([fixes.time_ns[25] - HALF + 100 * MS])  # a time of the grid
     # 0.02 i^2: halfway between two fixes the line lies 0.02 / 4 above the parabola
@@ -300,15 +300,15 @@ def test_the_lever_arm_of_the_antenna_is_taken_off_where_the_mount_has_one(frame
     east = [dialect.MAVLink_attitude_message(40 * i, 0, 0, np.pi / 2, 0, 0, 0) for i in range(251)]
     boot = hover(frames_of, [position(200 * i, 58.394, 15.574, 70.0) for i in range(51)], attitudes=east)
     made = fly(boot, mount=replace(Mount(), gps_position_m=(0.0, 1.0, 0.2)))
-    np.testing.assert_allclose(made.position_m[100], [-1.0, 0.0, -0.2], atol=1e-6)
+    np.testing.assert_allclose(made.position_m[100], [-1.0, 0.0, -0.2], rtol=0, atol=1e-6)
 
 
 def test_sigmas_are_what_the_receiver_states_else_its_dilution(frames_of: FramesOf) -> None:
     places = [position(200 * i, 58.394, 15.574, 70.0) for i in range(51)]
     own = fly(hover(frames_of, places + [gps(200 * i, 58.394, 15.574, 70.0, h_acc=800, v_acc=1500) for i in range(51)]))
-    np.testing.assert_allclose(own.sigma_position_m, [[0.8, 0.8, 1.5]] * len(own), atol=1e-9)
+    np.testing.assert_allclose(own.sigma_position_m, [[0.8, 0.8, 1.5]] * len(own), rtol=0, atol=1e-9)
     dilution = fly(hover(frames_of, places + [gps(200 * i, 58.394, 15.574, 70.0, eph=140, epv=200) for i in range(51)]))
-    np.testing.assert_allclose(dilution.sigma_position_m, [[3.5, 3.5, 5.0]] * len(dilution), atol=1e-9)
+    np.testing.assert_allclose(dilution.sigma_position_m, [[3.5, 3.5, 5.0]] * len(dilution), rtol=0, atol=1e-9)
     assert (fly(hover(frames_of, places)).sigma_position_m > 0).all()
 
 

@@ -53,7 +53,7 @@ def test_rates_on_the_grid_are_those_between_the_two_filters(hz: float) -> None:
     assert (heard == 1.0).all()
     middle = slice(1500, 4500)
     expected = gain(hz, correlation.COARSE_HZ) * (1.0 - gain(hz, correlation.HIGH_PASS_HZ)) * sines(grid, hz)
-    np.testing.assert_allclose(values[middle], expected[middle], atol=2e-3)
+    np.testing.assert_allclose(values[middle], expected[middle], rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize(("rate_hz", "limit_s"), [(100.0, 1.0), (4.0, 1.5)])
@@ -76,7 +76,7 @@ def test_a_silence_leaves_no_step_at_its_ends() -> None:
     """Filled with the median: offsets of tens of degrees a second do not ring into what was heard."""
     time_s = np.concatenate([np.arange(0.0, 20.0, 0.01), np.arange(25.0, 45.0, 0.01)])
     still = GyroTrack("a", ticks(time_s), np.full((len(time_s), 3), 7.0))
-    np.testing.assert_allclose(correlation._on_grid(still)[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(correlation._on_grid(still)[0], 0.0, rtol=0, atol=1e-9)
 
 
 # The samples of the slow one -------------------------------------------------------------------------------------------
@@ -91,7 +91,7 @@ def test_samples_lie_at_the_nearest_points_of_the_grid_and_nothing_between_them(
     assert np.flatnonzero(heard).tolist() == np.rint(time_s * 100.0).astype(int).tolist()
     assert (values[heard == 0.0] == 0.0).all()
     # 0.9 Hz passes the filter of 0.2 Hz whole; samples 0.25 s apart hold its slow part to some percent
-    np.testing.assert_allclose(values[heard > 0.0][20:-20], sines(time_s, 0.9)[20:-20], atol=0.06)
+    np.testing.assert_allclose(values[heard > 0.0][20:-20], sines(time_s, 0.9)[20:-20], rtol=0, atol=0.06)
 
 
 def test_samples_of_one_place_are_averaged() -> None:
@@ -101,7 +101,7 @@ def test_samples_of_one_place_are_averaged() -> None:
     assert (heard <= 1.0).all()
     assert heard.sum() == len(time_s) / 2
     mean = 0.5 * (rates[0::2] + rates[1::2])
-    np.testing.assert_allclose(values[heard > 0.0][20:-20], mean[20:-20], atol=0.05)
+    np.testing.assert_allclose(values[heard > 0.0][20:-20], mean[20:-20], rtol=0, atol=0.05)
 
 
 def test_what_turns_slowly_is_taken_out_of_the_samples() -> None:
@@ -269,7 +269,7 @@ def test_the_smoothed_gyro_is_the_filters_to_both_ends_and_between_samples(hz: f
     time_s = np.arange(0.0, 20.003, 0.01)
     smooth = _smooth_spline(GyroTrack("a", 5 * S + ticks(time_s), sines(time_s, hz)), 5.0)
     at = np.random.default_rng(3).uniform(2.0, 18.0, 200)
-    np.testing.assert_allclose(smooth(at), gain(hz, 5.0) * sines(at, hz), atol=1.5e-3)
+    np.testing.assert_allclose(smooth(at), gain(hz, 5.0) * sines(at, hz), rtol=0, atol=1.5e-3)
     assert smooth.x[0] == 0.0
     assert time_s[-1] <= smooth.x[-1] < time_s[-1] + 2.0 / 400.0
 
@@ -288,7 +288,7 @@ def test_a_gyro_with_one_axis_turned_over_is_fitted_and_said() -> None:
     )
     assert found.note == "the gyros fit only with one axis of the opposite sign"
     assert found.mount_angle_deg is None
-    np.testing.assert_allclose(found.mat_ins_lidar, mirror, atol=1e-3)
+    np.testing.assert_allclose(found.mat_ins_lidar, mirror, rtol=0, atol=1e-3)
     assert found.curve is peak.curve
 
 
@@ -312,7 +312,7 @@ def test_an_axis_that_did_not_turn_stays_where_the_mount_put_it() -> None:
         20.0,
         tilted,
     )
-    np.testing.assert_allclose(found.mat_ins_lidar, tilted, atol=1e-4)
+    np.testing.assert_allclose(found.mat_ins_lidar, tilted, rtol=0, atol=1e-4)
     assert found.mount_angle_deg == pytest.approx(0.0, abs=0.01)
 
 
@@ -337,6 +337,6 @@ def test_correlations_of_the_unknowns_stay_what_they_were() -> None:
     normal = mixing.T @ mixing * len(time_s)
     found, plain = _covariance(time_s, scores, normal), np.linalg.inv(normal)
     sigma, before = np.sqrt(np.diag(found)), np.sqrt(np.diag(plain))
-    np.testing.assert_allclose(found / np.outer(sigma, sigma), plain / np.outer(before, before), atol=1e-12)
+    np.testing.assert_allclose(found / np.outer(sigma, sigma), plain / np.outer(before, before), rtol=0, atol=1e-12)
     # blocks of 2 s hold 20 equal samples: variances are twenty times the plain ones, learnt from a hundred blocks
     assert ((sigma / before) ** 2).mean() == pytest.approx(20.0, rel=0.3)

@@ -46,7 +46,7 @@ def test_a_low_pass_keeps_what_is_constant_and_half_the_power_at_its_cut_off(rat
     assert (found[middle, 0] ** 2).mean() == pytest.approx(0.5 * (values[middle, 0] ** 2).mean(), rel=1e-3)
     np.testing.assert_allclose(found[:, 1], 3.0)
     # no delay: what is left of the sine crosses zero where it did
-    np.testing.assert_allclose(found[middle, 0], np.sqrt(0.5) * values[middle, 0], atol=1e-3)
+    np.testing.assert_allclose(found[middle, 0], np.sqrt(0.5) * values[middle, 0], rtol=0, atol=1e-3)
 
 
 # Correlation -----------------------------------------------------------------------------------------------------------
@@ -59,7 +59,7 @@ def test_sums_over_all_lags_are_those_of_two_loops() -> None:
     assert found.shape == (len(a) + len(b) - 1, 2, 3)
     for place, lag in enumerate(range(1 - len(a), len(b))):
         expected = sum(np.outer(b[i + lag], a[i]) for i in range(len(a)) if 0 <= i + lag < len(b))
-        np.testing.assert_allclose(found[place], expected, atol=1e-12)
+        np.testing.assert_allclose(found[place], expected, rtol=0, atol=1e-12)
 
 
 def test_the_rotation_of_a_correlation_is_the_one_that_aligns_the_vectors_best() -> None:
@@ -69,7 +69,7 @@ def test_the_rotation_of_a_correlation_is_the_one_that_aligns_the_vectors_best()
     b = turned.apply(a) + 0.05 * rng.normal(size=(50, 3))
     found = correlation._rotation(b.T @ a, None)
     expected, _ = Rotation.align_vectors(b, a)
-    np.testing.assert_allclose(found, expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(found, expected.as_matrix(), rtol=0, atol=1e-12)
     # a mirrored axis is kept where the data insist
     mirrored = correlation._rotation((b * [1, 1, -1]).T @ a, np.eye(3))
     assert np.linalg.det(mirrored) == pytest.approx(-1.0)
@@ -93,7 +93,7 @@ def test_the_peak_of_a_track_with_a_later_part_of_itself_is_one_at_the_true_shif
     assert score[np.argmin(np.abs(offsets - peak.offset_ns))] == score.max() == peak.height
     away = np.abs(offsets - peak.offset_ns) > S
     assert peak.rival == score[away].max() < 0.7
-    np.testing.assert_allclose(peak.mat_ins_lidar, np.eye(3), atol=0.02)
+    np.testing.assert_allclose(peak.mat_ins_lidar, np.eye(3), rtol=0, atol=0.02)
     # at least 10 s in common at either end of what was tried
     assert offsets.min() > ins.time_ns[0] - whole.time_ns[-1] + 9.5 * S
     assert offsets.max() < ins.time_ns[-1] - whole.time_ns[0] - 9.5 * S
@@ -159,17 +159,17 @@ def test_whatever_bends_slowly_is_a_bias_and_is_taken_out_whole() -> None:
     knots = np.linspace(time_s[0], time_s[-1], 4)  # every 30 s
     bent = np.stack([np.interp(time_s, knots, level) for level in ([1, -2, 3, 5], [9, 9, 9, 9], [0, 0, 1, 0])], axis=1)
     # a millionth of a ridge over some 300 samples a knot
-    np.testing.assert_allclose(unbias(bent), 0.0, atol=1e-6)
+    np.testing.assert_allclose(unbias(bent), 0.0, rtol=0, atol=1e-6)
     fast = np.sin(2 * np.pi * time_s)[:, None] * [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(unbias(fast + bent), unbias(fast), atol=1e-6)
+    np.testing.assert_allclose(unbias(fast + bent), unbias(fast), rtol=0, atol=1e-6)
     assert (unbias(fast) ** 2).mean() == pytest.approx((fast**2).mean(), rel=0.02)
-    np.testing.assert_allclose(bent.T @ unbias(fast), 0.0, atol=1e-4)
+    np.testing.assert_allclose(bent.T @ unbias(fast), 0.0, rtol=0, atol=1e-4)
 
 
 def test_a_short_track_has_biases_at_its_two_ends() -> None:
     time_s = np.linspace(0.0, 12.0, 100)
     unbias = _bias_projector(time_s)
-    np.testing.assert_allclose(unbias((3.0 - time_s)[:, None] * np.ones(3)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(unbias((3.0 - time_s)[:, None] * np.ones(3)), 0.0, rtol=0, atol=1e-5)
     assert np.abs(unbias(np.abs(time_s - 6.0)[:, None] * np.ones(3))).max() > 1.0
 
 
@@ -183,12 +183,12 @@ def test_samples_weigh_what_their_axis_and_their_slope_allow() -> None:
     variance = level**2 + 0.25 * moved**2
     inlier = np.abs(residual) < 1.4 * np.sqrt(variance)
     # variances are learnt from 20 000 values an axis, and squares cut at 25: to some percent
-    np.testing.assert_allclose(weight[inlier] * variance[inlier], 1.0, atol=0.1)
-    np.testing.assert_allclose(curvature[inlier] * variance[inlier], 1.0, atol=0.1)
+    np.testing.assert_allclose(weight[inlier] * variance[inlier], 1.0, rtol=0, atol=0.1)
+    np.testing.assert_allclose(curvature[inlier] * variance[inlier], 1.0, rtol=0, atol=0.1)
     outlier = np.abs(residual) > 1.6 * np.sqrt(variance)
     assert (curvature[outlier] == 0.0).all()
     expected = 1.5 * np.sqrt(variance[outlier]) / np.abs(residual[outlier])
-    np.testing.assert_allclose(weight[outlier] * variance[outlier], expected, atol=0.1)
+    np.testing.assert_allclose(weight[outlier] * variance[outlier], expected, rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize("correlated", [False, True])

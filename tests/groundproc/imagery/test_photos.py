@@ -112,13 +112,13 @@ def test_dji_images_say_where_they_were_and_how_they_looked(recordings: Path) ->
     found = looked(recordings / "images" / "brighton" / "DJI_0018.JPG")
     assert found.fix is not None
     np.testing.assert_allclose(
-        (found.fix.latitude_deg, found.fix.longitude_deg), (46.842607083, -91.994559889), atol=1e-8
+        (found.fix.latitude_deg, found.fix.longitude_deg), (46.842607083, -91.994559889), rtol=0, atol=1e-8
     )
     assert (found.relative_m, found.width_px) == (39.8, 1600)
     assert found.mat_enu_camera is not None
-    np.testing.assert_allclose(found.mat_enu_camera @ [0, 0, 1], [0, 0, -1], atol=0.01)  # down
+    np.testing.assert_allclose(found.mat_enu_camera @ [0, 0, 1], [0, 0, -1], rtol=0, atol=0.01)  # down
     np.testing.assert_allclose(
-        found.mat_enu_camera @ [0, -1, 0], [0.5**0.5, 0.5**0.5, 0], atol=0.01
+        found.mat_enu_camera @ [0, -1, 0], [0.5**0.5, 0.5**0.5, 0], rtol=0, atol=0.01
     )  # up is north-east
     rig, numbers, _ = rig_of([found])
     assert numbers == [0]
@@ -142,7 +142,7 @@ def test_the_sequoia_s_cameras_are_those_of_its_xmp(recordings: Path, tmp_path: 
     nir = by_band[("nir",)].camera
     assert nir.model == "fisheye_polynomial"
     np.testing.assert_allclose(nir.focal_px * np.pi / 2, 1671.556624069)
-    np.testing.assert_allclose(nir.centre_px[0], 2.544297 / 0.00375 - 0.5, atol=0.1)
+    np.testing.assert_allclose(nir.centre_px[0], 2.544297 / 0.00375 - 0.5, rtol=0, atol=0.1)
     rgb = next(one for one in rig.cameras if one.camera.model == "radtan")
     np.testing.assert_allclose(rgb.line_delay_s * rgb.camera.height_px, 0.0475)
 

@@ -76,7 +76,7 @@ def test_it_shows_what_one_camera_in_the_middle_would_have_seen(made: Path) -> N
     poses, camera = read_poses(made / "poses.csv"), read_rig(made / "rig.yaml").cameras[0].camera
     assert len(poses) == 2
     for number, name in enumerate(poses.images):
-        np.testing.assert_allclose(poses.place_m[number], PLACES[number], atol=0.01)
+        np.testing.assert_allclose(poses.place_m[number], PLACES[number], rtol=0, atol=0.01)
         with rasterio.open(made / name) as file:
             shown = np.moveaxis(file.read(), 0, -1) / 255.0
         shot = rendered.Shot(poses.place_m[number], tuple(np.rad2deg(poses.angles_rad[number])))
@@ -125,4 +125,4 @@ def test_cameras_that_expose_apart_make_no_wide_image(
 def test_the_nearest_rotation_of_a_mean_is_between() -> None:
     one, other = (mat_world_camera(*np.deg2rad([[a], [0.0], [0.0]]))[0] for a in (10.0, 20.0))
     between = mat_world_camera(*np.deg2rad([[15.0], [0.0], [0.0]]))[0]
-    np.testing.assert_allclose(nearest_rotation(one + other), between, atol=1e-12)
+    np.testing.assert_allclose(nearest_rotation(one + other), between, rtol=0, atol=1e-12)

@@ -402,7 +402,7 @@ def test_points_are_placed_by_the_pose_of_their_own_time() -> None:
         SensorPath(0, quat, place),
     )  # fmt: skip
     expected = [[10.0, 0.0, 0.0], [0.5 + 10 * np.cos(0.1), 1.0 + 10 * np.sin(0.1), 0.0]]
-    assert np.allclose(cloud.points()[0], expected, atol=1e-5)
+    assert np.allclose(cloud.points()[0], expected, rtol=0, atol=1e-5)
 
 
 def test_a_tie_undoes_what_the_synchronisation_says() -> None:

@@ -73,7 +73,7 @@ def test_the_axes_of_a_plane_are_at_right_angles_to_each_other_and_to_its_normal
     for normal in [*Rotation.random(50, rng=np.random.default_rng(2)).as_matrix()[:, 2], np.eye(3)[0], -np.eye(3)[2]]:
         made = np.array(planes.axes_along(*normal.tolist())).reshape(2, 3)
         together = np.stack([normal, *made])
-        np.testing.assert_allclose(together @ together.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(together @ together.T, np.eye(3), rtol=0, atol=1e-14)
 
 
 class TestVoxels:
@@ -95,8 +95,8 @@ class TestVoxels:
     def test_a_floor_is_a_plane_through_its_mean(self) -> None:
         out = self.found(self.seen(self.FLOOR))
         assert out.good[0]
-        np.testing.assert_allclose(np.abs(out.normal[0]), [0.0, 0.0, 1.0], atol=1e-12)
-        np.testing.assert_allclose(out.mean_m[0], self.FLOOR.mean(axis=0), atol=1e-15)
+        np.testing.assert_allclose(np.abs(out.normal[0]), [0.0, 0.0, 1.0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(out.mean_m[0], self.FLOOR.mean(axis=0), rtol=0, atol=1e-15)
 
     def test_what_one_interval_saw_alone_is_none(self) -> None:
         assert not self.found(self.seen(self.FLOOR, knots=(3,))).good[0]
@@ -113,8 +113,8 @@ class TestVoxels:
         assert not self.found(self.seen(layers)).good[0]
         out = self.found(self.seen(layers, group=(1,) * 4 + (2,) * 4))
         assert out.good[0]
-        np.testing.assert_allclose(out.mean_m[0], layers.mean(axis=0), atol=1e-15)
-        np.testing.assert_allclose(np.abs(out.normal[0]), [0.0, 0.0, 1.0], atol=1e-12)
+        np.testing.assert_allclose(out.mean_m[0], layers.mean(axis=0), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(np.abs(out.normal[0]), [0.0, 0.0, 1.0], rtol=0, atol=1e-12)
 
 
 def test_points_are_sorted_by_their_voxels_and_keep_their_order_inside() -> None:

@@ -55,8 +55,8 @@ def test_a_path_turned_and_moved_as_a_whole_has_notchanged() -> None:
     moved, turned = changed(
         quat, position, frames.quat_multiply(np.repeat(turn, 200, axis=0), quat), position @ mat.T + [5.0, -3.0, 1.0]
     )
-    np.testing.assert_allclose(moved, 0.0, atol=1e-9)
-    np.testing.assert_allclose(turned, 0.0, atol=1e-9)
+    np.testing.assert_allclose(moved, 0.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(turned, 0.0, rtol=0, atol=1e-9)
 
 
 def test_one_pose_that_differs_shows_as_itself() -> None:

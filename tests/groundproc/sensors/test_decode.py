@@ -50,7 +50,7 @@ def assert_same(shots: Shots, expected: Told) -> None:
     assert (shots.intensity == intensity).all()
     assert (shots.laser == laser).all()
     assert (shots.returns == returns).all()
-    np.testing.assert_allclose(shots.xyz_m, np.stack([x, y, z], axis=1), atol=1e-5)
+    np.testing.assert_allclose(shots.xyz_m, np.stack([x, y, z], axis=1), rtol=0, atol=1e-5)
     off = (np.rad2deg(shots.azimuth_rad) * 100 - azimuth + 18_000) % 36_000 - 18_000
     assert np.abs(off).max() < 0.001  # of coordinates as float32: 2^-24 each, 1e-7 rad together
 
@@ -185,7 +185,7 @@ def test_the_sweep_of_a_block_is_turned_by_sine_and_cosine() -> None:
         firings._directions(step, fraction, np.cos(elevation)[None, :], found)
         angle = np.deg2rad(step / 100.0 * fraction)
         np.testing.assert_allclose(found[0], np.cos(elevation) * np.cos(angle), rtol=1e-10)
-        np.testing.assert_allclose(found[1], np.cos(elevation) * np.sin(angle), atol=1e-10)
+        np.testing.assert_allclose(found[1], np.cos(elevation) * np.sin(angle), rtol=0, atol=1e-10)
 
 
 def test_both_ends_of_a_window_are_within_it(data_payload: Callable[..., bytes]) -> None:
@@ -243,5 +243,5 @@ def test_corrections_of_a_laser_move_its_points_along_the_beam(data_payload: Cal
         for t in (nominal, LaserTable(nominal.elevation_rad, offset, nominal.height_m))
     )
     length = np.linalg.norm(moved.xyz_m, axis=1) - np.linalg.norm(plain.xyz_m, axis=1)
-    np.testing.assert_allclose(length, np.where(plain.laser == 5, 0.25, 0.0), atol=1e-5)
+    np.testing.assert_allclose(length, np.where(plain.laser == 5, 0.25, 0.0), rtol=0, atol=1e-5)
     assert (moved.range_m == plain.range_m).all()

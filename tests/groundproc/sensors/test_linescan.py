@@ -33,13 +33,13 @@ def test_each_return_is_where_and_when_its_line_says() -> None:
     # a range of 0 and one that is no number are no returns
     assert shots.range_m.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 0.5, 60.0, 60.5]
     since_us = np.array([0, 25, 50, 75, 100, 55_555.556 + 50, 55_555.556 + 75, 55_555.556 + 100])
-    np.testing.assert_allclose(shots.time_ns - LINE_NS, since_us * 1000, atol=1)
+    np.testing.assert_allclose(shots.time_ns - LINE_NS, since_us * 1000, rtol=0, atol=1)
     root = np.sqrt(0.5)
     directions = np.array([[1, 0, 0], [root, root, 0], [0, 1, 0], [-root, root, 0], [-1, 0, 0]])
     expected = shots.range_m[:, None] * directions[[0, 1, 2, 3, 4, 2, 3, 4]]
-    np.testing.assert_allclose(shots.xyz_m, expected, atol=1e-5)  # 60 m times the step of an angle of float32
+    np.testing.assert_allclose(shots.xyz_m, expected, rtol=0, atol=1e-5)  # 60 m times the step of an angle of float32
     off_deg = (np.rad2deg(shots.azimuth_rad[:5]) - AZIMUTHS_DEG + 180.0) % 360.0 - 180.0
-    np.testing.assert_allclose(off_deg, 0.0, atol=1e-4)
+    np.testing.assert_allclose(off_deg, 0.0, rtol=0, atol=1e-4)
     assert shots.intensity.tolist() == [0, 1, 254, 255, 0, 0, 4, 5]
     assert shots.returns.tolist() == [0x11] * 8
     assert shots.laser.tolist() == [0] * 8
@@ -74,8 +74,8 @@ def test_corrections_move_the_points_along_the_beam_and_off_the_plane() -> None:
     table = LaserTable(np.deg2rad([30.0]), np.array([0.5]), np.array([0.1]))
     (shots,) = LIDAR.decode(given, given["time_ns"], lasers=table)
     reach = np.array(RANGES_M[0]) + 0.5
-    np.testing.assert_allclose(shots.xyz_m[:, 2], reach * 0.5 + 0.1, atol=1e-6)
-    np.testing.assert_allclose(np.hypot(*shots.xyz_m[:, :2].T), reach * np.sqrt(0.75), atol=1e-6)
+    np.testing.assert_allclose(shots.xyz_m[:, 2], reach * 0.5 + 0.1, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(*shots.xyz_m[:, :2].T), reach * np.sqrt(0.75), rtol=0, atol=1e-6)
     assert shots.range_m.tolist() == list(RANGES_M[0])
     assert shots.lasers is table
 
@@ -91,7 +91,7 @@ def test_lines_tell_of_themselves_before_they_are_decoded() -> None:
     assert digest.azimuth_cdeg.tolist() == [[9_000, 4_500, 0, 31_500, 27_000]] * 2
     assert digest.mode.tolist() == [0, 0]
     assert dict(LIDAR.mode_names) == {0: "single"}
-    np.testing.assert_allclose(digest.record_ns, 1e9 / 18, atol=4)  # float32 of 1/18 s
+    np.testing.assert_allclose(digest.record_ns, 1e9 / 18, rtol=0, atol=4)  # float32 of 1/18 s
     assert digest.returns == 8
     assert [each.dtype for each in (digest.azimuth_cdeg, digest.mode, digest.record_ns)] == [
         np.int64,

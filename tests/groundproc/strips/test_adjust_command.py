@@ -47,7 +47,7 @@ def test_boresight_and_lever_arm_are_found_within_three_sigma(adjusted: Any) -> 
 
 def test_the_trajectory_comes_back_true_within_its_sigma(adjusted: Any, wrong_scan: aerial.Scan) -> None:
     found, truth = aerial.read_csv(adjusted.folder / "trajectory.csv"), wrong_scan.flight
-    np.testing.assert_allclose(found.time_s, truth.time_s, atol=1e-9)
+    np.testing.assert_allclose(found.time_s, truth.time_s, rtol=0, atol=1e-9)
     before = aerial.aligned(wrong_scan.wrong.place_m, truth.place_m)
     after = aerial.aligned(found.place_m, truth.place_m)
     assert np.sqrt(np.mean(before**2)) > 0.1
@@ -81,7 +81,7 @@ def test_nothing_but_coordinates_changes(adjusted: Any) -> None:
     assert new.header.parse_crs().to_epsg() == aerial.EPSG
     assert [v.record_data_bytes() for v in new.header.vlrs if v.user_id == "somebody"] == [b"kept"]
     assert new.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
-    np.testing.assert_allclose(new.header.mins, [new.x.min(), new.y.min(), new.z.min()], atol=1e-6)
+    np.testing.assert_allclose(new.header.mins, [new.x.min(), new.y.min(), new.z.min()], rtol=0, atol=1e-6)
 
 
 def test_noise_and_what_moves_are_moved_along_and_tell_nothing(
@@ -222,7 +222,7 @@ def test_several_files_with_seconds_of_the_week_and_their_own_strips(
     clouds = [laspy.read(tmp_path / "out" / name) for name in ("a.laz", "b.laz")]
     found = np.concatenate([np.stack([c.x, c.y, c.z], axis=1) for c in clouds])
     once = laspy.read(adjusted.folder / "cloud.laz")
-    np.testing.assert_allclose(found, np.stack([once.x, once.y, once.z], axis=1), atol=0.02)
+    np.testing.assert_allclose(found, np.stack([once.x, once.y, once.z], axis=1), rtol=0, atol=0.02)
     assert told["points"]["outside_trajectory"] == 0
 
 
@@ -242,7 +242,7 @@ def test_an_sbet_is_a_trajectory_too(tmp_path: Path, wrong_scan: aerial.Scan, ad
     assert main(["adjust", *words]) == 0
     one, other = (laspy.read(folder / "cloud.laz") for folder in (adjusted.folder, tmp_path / "out"))
     # positions of trajectory.csv are rounded to a hundredth of a millimetre
-    np.testing.assert_allclose(one.xyz, other.xyz, atol=0.0021)
+    np.testing.assert_allclose(one.xyz, other.xyz, rtol=0, atol=0.0021)
 
 
 # a scan and an adjustment of its own; in the quick suite: how .pos is read, and adjustments by trajectories with attitude
@@ -395,7 +395,7 @@ def test_files_of_all_versions_keep_what_they_hold(tmp_path: Path, version: str,
     for name in cloud.point_format.dimension_names:
         if name not in ("X", "Y", "Z"):
             assert (np.asarray(cloud[name]) == np.asarray(new[name])).all(), name
-    np.testing.assert_allclose(np.asarray(new["range"]), 12.34, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(new["range"]), 12.34, rtol=0, atol=1e-9)
     assert new.header.number_of_points_by_return[1] == len(scan.time_s)
     assert new.header.parse_crs().to_epsg() == aerial.EPSG
     if version == "1.4":

@@ -89,10 +89,10 @@ def test_planes_are_eliminated_as_if_they_were_unknowns(clusters: npt.NDArray[np
     cross = columns.T @ (weight * planes)
     wanted = columns.T @ (weight * columns) - cross @ np.linalg.solve(inner, cross.T)
     found = np.tril(made.normal())
-    np.testing.assert_allclose(found, np.tril(wanted), atol=2e-5 * np.abs(wanted).max())
+    np.testing.assert_allclose(found, np.tril(wanted), rtol=0, atol=2e-5 * np.abs(wanted).max())
     right = columns.T @ (made.rows.weight * made.rows.residual_m)
     right -= cross @ np.linalg.solve(inner, planes.T @ (made.rows.weight * made.rows.residual_m))
-    np.testing.assert_allclose(made.right(made.rows.residual_m), right, atol=1e-5 * np.abs(right).max())
+    np.testing.assert_allclose(made.right(made.rows.residual_m), right, rtol=0, atol=1e-5 * np.abs(right).max())
 
 
 def test_columns_are_the_derivatives_of_the_moved_points(clusters: npt.NDArray[np.void]) -> None:
@@ -114,11 +114,11 @@ def test_columns_are_the_derivatives_of_the_moved_points(clusters: npt.NDArray[n
         change = np.zeros(correction.coefficients.size)
         change[column] = step
         moved = along(correction.changed(change.reshape(-1, 6), {}))
-        np.testing.assert_allclose((moved - base) / step, columns[:, column], atol=0.02)
+        np.testing.assert_allclose((moved - base) / step, columns[:, column], rtol=0, atol=0.02)
     for number, name in enumerate(CONSTANTS):
         moved = along(correction.changed(np.zeros_like(correction.coefficients), {name: np.array([0, step, 0])}))
         size = correction.coefficients.size
-        np.testing.assert_allclose((moved - base) / step, columns[:, size + 3 * number + 1], atol=0.02)
+        np.testing.assert_allclose((moved - base) / step, columns[:, size + 3 * number + 1], rtol=0, atol=0.02)
 
 
 def test_the_prior_is_the_process_that_it_is_called() -> None:
@@ -137,7 +137,7 @@ def test_the_prior_is_the_process_that_it_is_called() -> None:
         found = at_knots @ covariance @ at_knots.T
         lag = np.abs(np.subtract.outer(np.arange(81), np.arange(81))) * np.sqrt(3) / tau
         # knots a tenth of the process' time apart: its steps are coarse by some percent
-        np.testing.assert_allclose(found, sigma**2 * (1 + lag) * np.exp(-lag), atol=0.08 * sigma**2)
+        np.testing.assert_allclose(found, sigma**2 * (1 + lag) * np.exp(-lag), rtol=0, atol=0.08 * sigma**2)
 
 
 def test_sigmas_are_those_of_the_inverse(clusters: npt.NDArray[np.void]) -> None:
@@ -174,7 +174,7 @@ def test_points_move_as_from_the_corrected_pose() -> None:
     now = Rotation.from_quat(turned, scalar_first=True)
     mount = Rotation.from_rotvec(correction.boresight_rad)
     again = position + now.apply(lever_arm + correction.lever_m) + (now * mount).apply(ray)
-    np.testing.assert_allclose(again, scanner + arm + move, atol=1e-9)
+    np.testing.assert_allclose(again, scanner + arm + move, rtol=0, atol=1e-9)
 
 
 def test_clusters_have_the_moments_of_their_points() -> None:
@@ -190,10 +190,10 @@ def test_clusters_have_the_moments_of_their_points() -> None:
     one = found[100]
     members = (np.floor(xyz) == np.floor(one["place"])).all(axis=1) & (time // BIN_NS == one["time_ns"] // BIN_NS)
     assert members.sum() == one["count"]
-    np.testing.assert_allclose(one["place"], xyz[members].mean(axis=0), atol=1e-9)
-    np.testing.assert_allclose(one["arm"], (xyz - eye)[members].mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(one["place"], xyz[members].mean(axis=0), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one["arm"], (xyz - eye)[members].mean(axis=0), rtol=0, atol=1e-5)
     off = xyz[members] - xyz[members].mean(axis=0)
-    np.testing.assert_allclose(one["scatter"], (off.T @ off)[np.triu_indices(3)], atol=1e-4)
+    np.testing.assert_allclose(one["scatter"], (off.T @ off)[np.triu_indices(3)], rtol=0, atol=1e-4)
 
 
 def test_memory_is_bounded_and_what_is_kept_is_kept_in_all_strips() -> None:
@@ -227,7 +227,7 @@ def test_merging_by_strip_keeps_the_moments() -> None:
     for one in found:
         members = xyz[(np.floor(xyz) == np.floor(one["place"])).all(axis=1)]
         assert one["count"] == len(members)
-        np.testing.assert_allclose(one["place"], members.mean(axis=0), atol=1e-7)
+        np.testing.assert_allclose(one["place"], members.mean(axis=0), rtol=0, atol=1e-7)
         off = members - members.mean(axis=0)
         np.testing.assert_allclose(one["scatter"], (off.T @ off)[np.triu_indices(3)], rtol=1e-4, atol=1e-3)
 
@@ -275,9 +275,9 @@ def route(tmp_path_factory: pytest.TempPathFactory) -> Route:
 
 def test_a_route_is_on_the_map_with_grid_north(route: Route) -> None:
     flight = aerial.flown()
-    np.testing.assert_allclose(route.poses.position_m + route.origin_m, flight.place_m, atol=2e-5)
+    np.testing.assert_allclose(route.poses.position_m + route.origin_m, flight.place_m, rtol=0, atol=2e-5)
     found = Rotation.from_quat(route.poses.quat_local_ins_wxyz, scalar_first=True)
-    np.testing.assert_allclose((found.inv() * flight.attitude).magnitude(), 0, atol=1e-7)
+    np.testing.assert_allclose((found.inv() * flight.attitude).magnitude(), 0, rtol=0, atol=1e-7)
 
 
 def occupied(
@@ -298,7 +298,9 @@ def test_strips_end_at_turns(route: Route) -> None:
     # two turns of 90 deg, 2 or 3 s apart, are one; the last one, 8 s after, is its own
     turns = np.cumsum(legs)[:-1] / 9.0
     cuts = strips.first_bin[1:] * BIN_NS * 1e-9
-    np.testing.assert_allclose(cuts, [turns[0:2].mean(), turns[2:4].mean(), turns[4:6].mean(), turns[6]], atol=1.5)
+    np.testing.assert_allclose(
+        cuts, [turns[0:2].mean(), turns[2:4].mean(), turns[4:6].mean(), turns[6]], rtol=0, atol=1.5
+    )
     assert (strips.of_bin >= 0).all()
 
 
@@ -337,7 +339,7 @@ def test_stamps_of_both_kinds_and_of_careless_programs_are_the_same_utc(tmp_path
         assert cloud.week_time == weekly
         (chunk,) = chunks([cloud], Clock(near_utc_ns=aerial.START_NS + 3 * 86_400 * 10**9))
         # a double of adjusted standard time resolves 60 ns, of Unix seconds 240 ns
-        np.testing.assert_allclose(chunk.time_ns - aerial.START_NS, wanted - aerial.START_NS, atol=500)
+        np.testing.assert_allclose(chunk.time_ns - aerial.START_NS, wanted - aerial.START_NS, rtol=0, atol=500)
 
 
 def test_a_bad_control_file_names_its_line(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_cubic_motion_is_followed_exactly(coefficients: list[float], seed: int
     at_ns = np.random.default_rng(seed).integers(time_ns[0], time_ns[-1], 200)
     u = ((at_ns - time_ns[0]) * 1e-9)[:, None]
     poses = trajectory(time_ns, position, velocity, Rotation.identity(20), np.zeros(3)).at(at_ns)
-    np.testing.assert_allclose(poses.position_m, c[0] + u * (c[1] + u * (c[2] + u * c[3])), atol=1e-9)
+    np.testing.assert_allclose(poses.position_m, c[0] + u * (c[1] + u * (c[2] + u * c[3])), rtol=0, atol=1e-9)
 
 
 def test_any_knots_are_joined_as_scipys_hermite_spline_joins_them() -> None:
@@ -77,7 +77,7 @@ def test_any_knots_are_joined_as_scipys_hermite_spline_joins_them() -> None:
     at_ns = rng.integers(time_ns[0], time_ns[-1] + 1, 500)
     poses = trajectory(time_ns, position, velocity, Rotation.identity(30), np.zeros(3)).at(at_ns)
     expected = CubicHermiteSpline(t, position, velocity, axis=0)((at_ns - time_ns[0]) * 1e-9)
-    np.testing.assert_allclose(poses.position_m, expected, atol=1e-9)
+    np.testing.assert_allclose(poses.position_m, expected, rtol=0, atol=1e-9)
 
 
 @settings(max_examples=40, deadline=None)
@@ -103,7 +103,7 @@ def test_a_turn_at_constant_rate_is_followed_exactly(
     expected = base * Rotation.from_rotvec(((at_ns - time_ns[0]) * 1e-9)[:, None] * np.array(rate))
     poses = made.at(at_ns)
     assert angle_between(poses.quat_local_ins_wxyz, expected).max() < 1e-7
-    np.testing.assert_allclose(np.linalg.norm(poses.quat_local_ins_wxyz, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(poses.quat_local_ins_wxyz, axis=1), 1.0, rtol=0, atol=1e-12)
 
 
 def test_a_changing_rate_is_followed_to_the_fourth_order_of_the_step() -> None:
@@ -218,7 +218,7 @@ def test_headings_run_from_0_to_below_360(tmp_path: Path) -> None:
     write_trajectory(tmp_path / "t.csv", trajectory(time_ns, np.zeros((8, 3)), np.zeros((8, 3)), turned, np.zeros(3)))
     with (tmp_path / "t.csv").open() as file:
         written = [float(row["heading_deg"]) for row in csv.DictReader(file)]
-    np.testing.assert_allclose(written, [0, 0, 0, 0, 359.9, 180, 180, 90], atol=1e-5)
+    np.testing.assert_allclose(written, [0, 0, 0, 0, 359.9, 180, 180, 90], rtol=0, atol=1e-5)
 
 
 @settings(max_examples=20, deadline=None)
@@ -240,13 +240,13 @@ def test_written_and_read_it_is_the_same_trajectory(seed: int, tmp_path_factory:
     with path.open() as file:
         rows = list(csv.DictReader(file))
     local = np.array([[float(r[f"{n}_m"]) for n in ("east", "north", "up")] for r in rows])
-    np.testing.assert_allclose(again.position_m, local, atol=2e-4)
+    np.testing.assert_allclose(again.position_m, local, rtol=0, atol=2e-4)
     assert angle_between(again.quat_local_ins_wxyz, turned).max() < np.deg2rad(3e-5)
-    np.testing.assert_allclose(again.sigma_attitude_rad, made.sigma_attitude_rad, atol=1e-6)
+    np.testing.assert_allclose(again.sigma_attitude_rad, made.sigma_attitude_rad, rtol=0, atol=1e-6)
     # between the knots too: velocities and rates come from differences
     at_ns = rng.integers(time_ns[0], time_ns[-1], 100)
     expected = CubicHermiteSpline(t, local, np.tile(speed, (60, 1)), axis=0)((at_ns - time_ns[0]) * 1e-9)
-    np.testing.assert_allclose(again.at(at_ns).position_m, expected, atol=5e-4)
+    np.testing.assert_allclose(again.at(at_ns).position_m, expected, rtol=0, atol=5e-4)
 
 
 def test_the_minimum_of_columns_is_read_and_others_are_passed_over(tmp_path: Path) -> None:

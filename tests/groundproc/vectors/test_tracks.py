@@ -57,4 +57,4 @@ def test_lines_follow_the_path_and_end_at_its_gap(ending: str, tmp_path: Path) -
     distance = np.abs(found[:, None] - expected[None]).max(axis=2).min(axis=1)
     assert distance.max() <= digits
     assert 95 <= len(found) <= 100
-    np.testing.assert_allclose(found[[0, -1]], expected[[0, -1]], atol=digits)
+    np.testing.assert_allclose(found[[0, -1]], expected[[0, -1]], rtol=0, atol=digits)

@@ -87,7 +87,7 @@ def test_a_course_that_a_spline_can_follow_is_followed_and_vibration_is_not() ->
     grid = np.arange(len(path.quat)) / STEPS
     inside = slice(2 * STEPS, -2 * STEPS)
     cubic = 1.0 + 0.3 * grid - 0.02 * grid**2 + 1e-4 * grid**3
-    np.testing.assert_allclose((follow @ cubic)[inside], cubic[inside], atol=1e-9)
+    np.testing.assert_allclose((follow @ cubic)[inside], cubic[inside], rtol=0, atol=1e-9)
     # scipy's spline through the knots is another way of following; both leave the same of a random walk between knots, to a tenth
     walk = np.cumsum(np.random.default_rng(1).normal(size=(len(grid), 200)), axis=0)
     scipys = make_interp_spline(grid[::STEPS], walk[::STEPS], k=3)(grid)
@@ -124,7 +124,9 @@ def test_the_covariance_is_the_dense_sandwich(posed: tuple[Problem, Noise], unkn
     at = slice(unknowns.names[names[0]].start, unknowns.names[names[1]].stop)
     found = posterior.covariance(names)
     scale = np.sqrt(np.diag(dense)[at])
-    np.testing.assert_allclose(found / np.outer(scale, scale), dense[at, at] / np.outer(scale, scale), atol=0.01)
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), dense[at, at] / np.outer(scale, scale), rtol=0, atol=0.01
+    )
     # what all poses share: the shift before the turn, and more of it than what says where the whole lies knows of
     order = [3, 4, 5, 0, 1, 2]
     np.testing.assert_allclose(posterior.datum()[np.ix_(order, order)], found, rtol=1e-9)
@@ -168,7 +170,9 @@ def test_covariances_of_poses_are_the_dense_sandwich(posed: tuple[Problem, Noise
     sigma = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
     known, drawn = posterior.spread(60).moments(poses)
     found = (known + drawn) / (sigma[:, :, None] * sigma[:, None, :])
-    np.testing.assert_allclose(found, expected / (sigma[:, :, None] * sigma[:, None, :]), atol=3.0 / np.sqrt(60))
+    np.testing.assert_allclose(
+        found, expected / (sigma[:, :, None] * sigma[:, None, :]), rtol=0, atol=3.0 / np.sqrt(60)
+    )
     # what needs no drawing is most of where the whole lies
     shares = np.diagonal(known, axis1=1, axis2=2)[:, :3] / np.square(sigma[:, :3])
     assert shares.min() > 0.8

@@ -74,12 +74,12 @@ def test_an_error_of_the_unknowns_is_the_change_that_it_makes_of_each_pose(
         (found.sigma_position_m, changed[:, :3], 0.02),
         (found.sigma_attitude_rad, changed[:, 3:], 0.11),
     ):
-        np.testing.assert_allclose(sigma, np.abs(true), atol=share * np.linalg.norm(true, axis=1).max())
+        np.testing.assert_allclose(sigma, np.abs(true), rtol=0, atol=share * np.linalg.norm(true, axis=1).max())
     outer = changed[:, :, None] * changed[:, None, :]
     large = np.abs(changed) > 5e-5
     both = large[:, :, None] & large[:, None, :]
     assert both.sum() > 1000
-    np.testing.assert_allclose(found.correlation[both], np.sign(outer)[both], atol=2e-3)
+    np.testing.assert_allclose(found.correlation[both], np.sign(outer)[both], rtol=0, atol=2e-3)
 
 
 def test_the_correlations_are_those_of_samples() -> None:
@@ -98,7 +98,7 @@ def test_the_correlations_are_those_of_samples() -> None:
     wanted = np.corrcoef(np.hstack([drawn[:, :3], angles]).T)
     found = pose_errors(only_known(root.T), lambda x: np.tile(x, (3, 1)), np.full(3, pitch), smooth=1, smooth_draws=1)
     # of so many samples a correlation is right to 1/450
-    np.testing.assert_allclose(found.correlation, np.tile(wanted, (3, 1, 1)), atol=4 / 450)
+    np.testing.assert_allclose(found.correlation, np.tile(wanted, (3, 1, 1)), rtol=0, atol=4 / 450)
     np.testing.assert_allclose(found.sigma_position_m[0], np.sqrt(np.square(root).sum(axis=1))[:3], rtol=1e-12)
 
 
@@ -110,7 +110,9 @@ def test_what_is_drawn_only_is_found_with_draws_enough() -> None:
     spread = Spread(draws, np.zeros_like(draws), np.zeros((0, 6)))
     found = pose_errors(spread, lambda x: x[None] * [1, 1, 1, 1, 1, -1], np.zeros(1), smooth=1, smooth_draws=1)
     sigma = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(found.correlation[0], covariance / np.outer(sigma, sigma), atol=4 / np.sqrt(4000))
+    np.testing.assert_allclose(
+        found.correlation[0], covariance / np.outer(sigma, sigma), rtol=0, atol=4 / np.sqrt(4000)
+    )
 
 
 def test_the_sigmas_are_those_of_the_variances_and_the_correlations_always_a_covariances() -> None:
@@ -137,8 +139,8 @@ def test_the_nearest_semidefinite_matrix_is_the_matrix_itself_where_it_is_one() 
     rng = np.random.default_rng(1)
     root = rng.normal(size=(5, 6, 3))
     good = root @ np.swapaxes(root, 1, 2)
-    np.testing.assert_allclose(semidefinite(good), good, atol=1e-12)
-    np.testing.assert_allclose(semidefinite(-good), 0.0, atol=1e-12)
+    np.testing.assert_allclose(semidefinite(good), good, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(semidefinite(-good), 0.0, rtol=0, atol=1e-12)
 
 
 def test_windows_that_are_joined_add_what_the_joining_does_not_know() -> None:

@@ -71,9 +71,9 @@ def test_three_windows_keep_their_places() -> None:
     ]
     whole = joined_path([window(0, 40, moved[0]), window(30, 70, moved[1]), window(60, 90, moved[2])])
     place = (whole.position_m - flown(0, 90).position_m)[:, 0]
-    np.testing.assert_allclose(place[: 30 * STEPS], 0.0, atol=1e-12)
-    np.testing.assert_allclose(place[40 * STEPS : 60 * STEPS], 0.01, atol=1e-12)
-    np.testing.assert_allclose(place[70 * STEPS :], 0.02, atol=1e-12)
+    np.testing.assert_allclose(place[: 30 * STEPS], 0.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(place[40 * STEPS : 60 * STEPS], 0.01, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(place[70 * STEPS :], 0.02, rtol=0, atol=1e-12)
 
 
 def test_a_path_is_laid_on_the_begin_of_the_one_before_as_a_rigid_body() -> None:

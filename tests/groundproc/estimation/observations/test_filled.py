@@ -52,7 +52,7 @@ def test_a_cluster_has_three_rows_along_axes_at_right_angles() -> None:
     assert not rows.plane.any()
     for cluster in rows.cluster[:20].tolist():
         axes = rows.jacobian[rows.cluster == cluster, 3:].astype(float)
-        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-5)
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), rtol=0, atol=1e-5)
 
 
 def test_without_being_asked_for_there_are_none() -> None:

@@ -92,14 +92,14 @@ def test_the_rows_are_of_many_voxels_and_slices(rows: Rows) -> None:
 def test_the_normal_matrix_is_schurs_complement_of_the_planes(rows: Rows) -> None:
     normal, _ = reduced(rows)
     found = np.stack([rows.apply(column) for column in np.eye(SIZE)], axis=1)
-    np.testing.assert_allclose(found, normal, atol=1e-9 * np.abs(normal).max())
-    np.testing.assert_allclose(found, found.T, atol=1e-9 * np.abs(normal).max())
+    np.testing.assert_allclose(found, normal, rtol=0, atol=1e-9 * np.abs(normal).max())
+    np.testing.assert_allclose(found, found.T, rtol=0, atol=1e-9 * np.abs(normal).max())
     assert np.linalg.eigvalsh(found).min() > -1e-9 * np.abs(normal).max()
 
 
 def test_the_gradient_is_that_of_the_cost_with_the_planes_at_their_best(rows: Rows) -> None:
     _, right = reduced(rows)
-    np.testing.assert_allclose(rows.gradient(), right, atol=1e-9 * np.abs(right).max())
+    np.testing.assert_allclose(rows.gradient(), right, rtol=0, atol=1e-9 * np.abs(right).max())
 
 
 def test_the_cost_is_what_dense_least_squares_leave(rows: Rows) -> None:
@@ -119,7 +119,7 @@ def test_what_the_rows_see_is_the_transpose_of_what_they_spread(rows: Rows) -> N
     rng = np.random.default_rng(2)
     values, vector = rng.normal(size=len(rows)), rng.normal(size=SIZE)
     by_path, _, _ = dense(rows)
-    np.testing.assert_allclose(rows.along(vector), by_path @ vector, atol=1e-9 * np.abs(by_path @ vector).max())
+    np.testing.assert_allclose(rows.along(vector), by_path @ vector, rtol=0, atol=1e-9 * np.abs(by_path @ vector).max())
     assert rows.spread(values) @ vector == pytest.approx(values @ rows.seen(vector), rel=1e-9)
     # the normal matrix is what is spread of what is along
     np.testing.assert_allclose(rows.spread(rows.along(vector)), rows.apply(vector), rtol=1e-7, atol=1e-3)
@@ -131,7 +131,7 @@ def test_the_band_is_the_normal_matrix_with_the_planes_known(rows: Rows) -> None
     for k, blocks in enumerate(rows.band()):
         at = slice(6 * k, 6 * k + 24)
         band[at, at] += blocks.transpose(0, 2, 1, 3).reshape(24, 24)
-    np.testing.assert_allclose(band, expected, atol=1e-9 * expected.max())
+    np.testing.assert_allclose(band, expected, rtol=0, atol=1e-9 * expected.max())
 
 
 def test_rows_are_the_distances_from_the_planes_and_their_derivatives(path: Path, rows: Rows) -> None:
@@ -151,15 +151,15 @@ def test_rows_are_the_distances_from_the_planes_and_their_derivatives(path: Path
 
     moved = world(path.corrected(coefficients)) - world(path)
     normal = rows.jacobian[:, 3:].astype(float)
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, rtol=0, atol=1e-6)
     by_path, _, _ = dense(rows)
     expected = (normal * moved).sum(axis=1)
     # 1e-4 rad at 10 m: second order 1e-7; single precision of the rows 1e-7 of 1e-3
-    np.testing.assert_allclose(by_path @ coefficients.ravel(), expected, atol=2e-6)
+    np.testing.assert_allclose(by_path @ coefficients.ravel(), expected, rtol=0, atol=2e-6)
     for at in range(0, len(rows), 97):
         seconds = (clusters.time_ns[rows.cluster[at]] - START_NS) * 1e-9
         k = int(rows.knot[at])
-        np.testing.assert_allclose(rows.weights[at], basis(float(seconds / 0.1 - k)), atol=1e-6)
+        np.testing.assert_allclose(rows.weights[at], basis(float(seconds / 0.1 - k)), rtol=0, atol=1e-6)
 
 
 def test_a_shifted_cluster_is_cut_as_no_part_of_its_plane(path: Path) -> None:

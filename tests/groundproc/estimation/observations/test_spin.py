@@ -97,9 +97,9 @@ def test_rows_change_by_the_columns_as_the_path_is_turned() -> None:
     turn = spin.turns(value)[at]
     expected = np.einsum("ni,ni->n", rows.jacobian[:, :3].astype(float), turn)
     columns = spin_columns(rows.jacobian, clusters.xyz_m[rows.cluster])
-    np.testing.assert_allclose(columns.along(value), expected, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(columns.along(value), expected, rtol=0, atol=1e-4 * np.abs(expected).max())
     whole = sum(columns.column(number) * value[number] for number in range(UNKNOWNS))
-    np.testing.assert_allclose(whole, columns.along(value), atol=1e-9)
+    np.testing.assert_allclose(whole, columns.along(value), rtol=0, atol=1e-9)
 
 
 def test_the_normal_matrix_is_that_of_all_columns_together() -> None:
@@ -143,7 +143,7 @@ def test_the_line_is_a_share_of_what_the_gyro_reads() -> None:
     unknowns = Unknowns(2)
     spin.unknowns(unknowns)
     (factor,) = spin.factors(unknowns)
-    np.testing.assert_allclose(factor.residual, 0.0, atol=1e-12)
+    np.testing.assert_allclose(factor.residual, 0.0, rtol=0, atol=1e-12)
     x = np.zeros(unknowns.size)
     x[unknowns.names[NAME]], x[unknowns.names[SHARE]] = LINE_RAD, 1.0
-    np.testing.assert_allclose(factor.matrix @ x, 0.0, atol=1e-12)
+    np.testing.assert_allclose(factor.matrix @ x, 0.0, rtol=0, atol=1e-12)

@@ -94,14 +94,16 @@ def test_trees_pull_the_pose_as_dense_least_squares_says() -> None:
     matched, residual, unheld, after = update(planes.arrays, body, counts, begun.arrays, covariance, np.zeros(3))
     assert matched == len(body)
     assert residual == 0.0  # of planes: there is none
-    np.testing.assert_allclose(begun.position_m, np.array([0.03, -0.02, 0.025]) + change[3:], atol=2e-4)
+    np.testing.assert_allclose(begun.position_m, np.array([0.03, -0.02, 0.025]) + change[3:], rtol=0, atol=2e-4)
     turned = frames.mat_from_quat(frames.quat_exp(change[None, :3]))[0]
-    np.testing.assert_allclose(frames.mat_from_quat(begun.quat[None])[0], mat @ turned, atol=5e-5)
+    np.testing.assert_allclose(frames.mat_from_quat(begun.quat[None])[0], mat @ turned, rtol=0, atol=5e-5)
     # the kernel's rows are those of the pose that it ends at, 5 mrad away
     dense = np.linalg.inv(information)
     sigma = np.sqrt(np.diag(dense))
-    np.testing.assert_allclose(after[:6, :6] / np.outer(sigma, sigma), dense / np.outer(sigma, sigma), atol=0.01)
-    np.testing.assert_allclose(after[6:, 6:], covariance[6:, 6:], atol=1e-12)
+    np.testing.assert_allclose(
+        after[:6, :6] / np.outer(sigma, sigma), dense / np.outer(sigma, sigma), rtol=0, atol=0.01
+    )
+    np.testing.assert_allclose(after[6:, 6:], covariance[6:, 6:], rtol=0, atol=1e-12)
     assert np.linalg.norm(change[3:]) > 0.02  # they did pull
     expected = weakest(j.T @ (w[:, None] * j))
     assert unheld == pytest.approx(expected, rel=0.02)

@@ -47,7 +47,7 @@ def test_means_over_steps_sum_to_the_integral(rate_hz: float, share: float) -> N
     # of an integral that swings by 1 / w
     assert np.abs(off[:, 0]).max() < 2.0 * share / (2 * np.pi * 2) * 2 + 1e-6
     assert np.abs(off[:, 1]).max() < 2.0 * share / (2 * np.pi * 3) * 2 + 1e-6
-    np.testing.assert_allclose(values[:, 2], 0.7, atol=1e-9)
+    np.testing.assert_allclose(values[:, 2], 0.7, rtol=0, atol=1e-9)
 
 
 def test_straight_lines_between_fast_samples_are_integrated_exactly() -> None:
@@ -62,7 +62,7 @@ def test_straight_lines_between_fast_samples_are_integrated_exactly() -> None:
     for c in range(3):
         track = np.interp(every, time_ns, samples[:, c])
         area = np.concatenate([[0.0], np.cumsum(0.5 * (track[1:] + track[:-1]) * np.diff(every))])
-        np.testing.assert_allclose(values[:, c], np.diff(np.interp(edges, every, area)) / STEP_NS, atol=1e-9)
+        np.testing.assert_allclose(values[:, c], np.diff(np.interp(edges, every, area)) / STEP_NS, rtol=0, atol=1e-9)
 
 
 def test_nothing_is_known_beyond_the_samples_or_in_a_silence() -> None:

@@ -40,7 +40,7 @@ def test_moments_of_a_voxel_are_numpys_however_they_came() -> None:
     assert planes.count == 1
     voxel, (mean, scatter) = planes.voxels[row_at(planes, points[0])], moments(points)
     assert voxel[COUNT] == 500
-    np.testing.assert_allclose(voxel[MEAN : MEAN + 3], mean, atol=1e-12)
+    np.testing.assert_allclose(voxel[MEAN : MEAN + 3], mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(voxel[SCATTER : SCATTER + 6], scatter, rtol=1e-9, atol=1e-9)
     values, vectors = np.linalg.eigh(np.cov(points.T, bias=True))
     assert abs(voxel[NORMAL : NORMAL + 3] @ vectors[:, 0]) > 1 - 1e-9
@@ -62,7 +62,7 @@ def test_clusters_bring_the_scatter_of_their_returns_along() -> None:
     planes.insert(world, clusters, 1e9)
     mean, scatter = moments(points.astype(np.float32).astype(float))
     voxel = planes.voxels[row_at(planes, points[0])]
-    np.testing.assert_allclose(voxel[MEAN : MEAN + 3], mean, atol=1e-6)
+    np.testing.assert_allclose(voxel[MEAN : MEAN + 3], mean, rtol=0, atol=1e-6)
     np.testing.assert_allclose(voxel[SCATTER : SCATTER + 6], scatter, rtol=1e-5, atol=1e-3)
 
 
@@ -78,10 +78,10 @@ def test_a_cluster_is_the_mean_of_its_returns_seen_from_where_the_sensor_was() -
     )
     assert len(clusters) == 1
     expected = (seen + np.stack([0.5 * g / STEPS, 0 * g, 0 * g], axis=1)).mean(axis=0)
-    np.testing.assert_allclose(world[0], expected, atol=1e-6)
+    np.testing.assert_allclose(world[0], expected, rtol=0, atol=1e-6)
     assert clusters["time_ns"][0] == pytest.approx(times.mean(), abs=1.0)
     place = 0.5 * clusters["time_ns"][0] / (STEPS * STEP_NS)
-    np.testing.assert_allclose(clusters["xyz"][0] + [place, 0.0, 0.0], expected, atol=1e-5)
+    np.testing.assert_allclose(clusters["xyz"][0] + [place, 0.0, 0.0], expected, rtol=0, atol=1e-5)
     assert clusters["range_m"][0] == pytest.approx(np.linalg.norm(seen, axis=1).mean(), abs=1e-4)
 
 

@@ -79,7 +79,7 @@ def test_a_good_slice_stays_as_it_is() -> None:
 def test_where_there_is_no_map_nothing_is_turned() -> None:
     seen = slice_seen(np.random.default_rng(6), np.full((STEPS + 1, 3), 1e-3))
     found = Within(DENSITY)(seen, np.zeros((STEPS + 1, 3)), np.eye(3), (PlaneMap(0.5).arrays, np.zeros(3)))
-    np.testing.assert_allclose(found, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found, 0.0, rtol=0, atol=1e-12)
 
 
 def test_level_ground_alone_does_not_turn_the_heading() -> None:

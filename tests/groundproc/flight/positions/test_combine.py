@@ -45,7 +45,7 @@ FLOATS = [2] * 20
 def test_fixes_that_agree_are_one_fix_with_the_sigma_of_one() -> None:
     found = combined(track(LONG), track(LONG, 0.004), LASTING)
     assert (found.agreed, found.contradicted, found.unsupported) == (20, 0, 0)
-    np.testing.assert_allclose(north_m(found.solution), 0.002, atol=1e-5)
+    np.testing.assert_allclose(north_m(found.solution), 0.002, rtol=0, atol=1e-5)
     np.testing.assert_allclose(found.solution.sigma_m, 0.01, rtol=1e-6)
 
 
@@ -53,7 +53,7 @@ def test_fixes_that_contradict_are_a_float_as_wide_as_their_difference() -> None
     found = combined(track(LONG), track(LONG, 0.4), LASTING)
     assert (found.agreed, found.contradicted) == (0, 20)
     assert (found.solution.quality == Quality.FLOAT).all()
-    np.testing.assert_allclose(north_m(found.solution), 0.2, atol=1e-3)
+    np.testing.assert_allclose(north_m(found.solution), 0.2, rtol=0, atol=1e-3)
     np.testing.assert_allclose(found.solution.sigma_m[:, 1], 0.4, rtol=0.01)
     np.testing.assert_allclose(found.solution.sigma_m[:, 0], 0.01, rtol=0.01)
 
@@ -62,20 +62,20 @@ def test_of_two_fixes_the_lasting_one_is_believed() -> None:
     for first, second, place in ((track(LONG), track(SHORT, 0.4), 0.0), (track(SHORT), track(LONG, 0.4), 0.4)):
         found = combined(first, second, LASTING).solution
         assert (found.quality[10:15] == Quality.FIX).all()
-        np.testing.assert_allclose(north_m(found)[10:15], place, atol=1e-3)
+        np.testing.assert_allclose(north_m(found)[10:15], place, rtol=0, atol=1e-3)
 
 
 def test_a_lasting_fix_within_the_others_float_is_kept() -> None:
     found = combined(track(LONG), track(FLOATS, 0.4, 0.3), LASTING).solution
     assert (found.quality == Quality.FIX).all()
-    np.testing.assert_allclose(north_m(found), 0.0, atol=1e-6)
+    np.testing.assert_allclose(north_m(found), 0.0, rtol=0, atol=1e-6)
 
 
 def test_a_lasting_fix_against_the_others_float_is_not() -> None:
     found = combined(track(FLOATS, 0.0, 0.05), track(LONG, 0.4), LASTING)
     assert found.contradicted == 20
     assert (found.solution.quality == Quality.FLOAT).all()
-    np.testing.assert_allclose(north_m(found.solution), 0.0, atol=1e-6)
+    np.testing.assert_allclose(north_m(found.solution), 0.0, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.solution.sigma_m[:, 1], np.hypot(0.05, 0.4), rtol=0.01)
 
 
@@ -83,14 +83,14 @@ def test_a_short_fix_of_one_run_alone_is_not_believed() -> None:
     found = combined(track(SHORT), track(FLOATS, 0.1, 0.3), LASTING)
     assert found.unsupported == 5
     assert (found.solution.quality == Quality.FLOAT).all()
-    np.testing.assert_allclose(north_m(found.solution)[10:15], 0.1, atol=1e-3)
+    np.testing.assert_allclose(north_m(found.solution)[10:15], 0.1, rtol=0, atol=1e-3)
     np.testing.assert_allclose(found.solution.sigma_m[10:15], 0.3, rtol=1e-6)
     assert combined(track(SHORT), track(FLOATS, 0.1, 0.3), 0.0).solution.quality[12] == Quality.FIX
 
 
 def test_floats_are_weighted_and_grow_where_they_contradict() -> None:
     found = combined(track(FLOATS, 0.0, 0.1), track(FLOATS, 0.1, 0.2), LASTING).solution
-    np.testing.assert_allclose(north_m(found), 0.02, atol=1e-4)
+    np.testing.assert_allclose(north_m(found), 0.02, rtol=0, atol=1e-4)
     np.testing.assert_allclose(found.sigma_m, 1 / np.hypot(1 / 0.1, 1 / 0.2), rtol=1e-3)
     apart = combined(track(FLOATS, 0.0, 0.1), track(FLOATS, 2.0, 0.2), LASTING).solution
     assert apart.sigma_m[0, 1] == pytest.approx(
@@ -103,7 +103,7 @@ def test_the_better_kind_wins_and_epochs_of_one_run_stay() -> None:
     for pair in ((single, fixed), (fixed, single)):
         found = combined(*pair, LASTING).solution
         assert found.quality.tolist() == [5] * 5 + [1] * 15
-        np.testing.assert_allclose(north_m(found)[5:], 0.0, atol=1e-6)
+        np.testing.assert_allclose(north_m(found)[5:], 0.0, rtol=0, atol=1e-6)
     late = replace(track(LONG), time_ns=np.arange(10, 30) * 10**9)
     found = combined(track(LONG), late, LASTING)
     assert found.agreed == 10
@@ -125,7 +125,7 @@ def test_what_the_code_contradicts_is_put_to_where_the_code_has_it() -> None:
     assert 20 <= number <= 25
     assert (found.quality[:15] == Quality.FIX).all()
     assert (found.quality[20:] == Quality.DGPS).all()
-    np.testing.assert_allclose(north_m(found)[20:], 0.5, atol=1e-3)
+    np.testing.assert_allclose(north_m(found)[20:], 0.5, rtol=0, atol=1e-3)
     np.testing.assert_allclose(found.sigma_m[20:], 2.0)
     assert astray.quality[30] == Quality.FLOAT
 
@@ -162,7 +162,7 @@ def test_a_run_of_fixes_ends_where_its_velocities_do_not_explain_a_step() -> Non
         found = combined(*pair, LASTING)
         assert found.contradicted == 5
         assert (found.solution.quality == Quality.FIX).all()
-        np.testing.assert_allclose(north_m(found.solution), 0.0, atol=1e-3)
+        np.testing.assert_allclose(north_m(found.solution), 0.0, rtol=0, atol=1e-3)
     assert found.solution.velocity_m_s is not None
     # without velocities, nobody can tell
     blind = replace(jumping, velocity_m_s=None, velocity_covariance_m2_s2=None)

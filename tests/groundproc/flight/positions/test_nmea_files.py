@@ -49,12 +49,12 @@ def test_position_date_velocity_and_sigma_of_one_epoch(write: Callable[..., Path
         assert found.undulation_m is not None
         assert found.height_m[0] + found.undulation_m[0] == pytest.approx(110.0)
         assert found.velocity_m_s is not None
-        np.testing.assert_allclose(found.velocity_m_s[0, :2], [10 * 1852 / 3600, 0.0], atol=1e-12)
+        np.testing.assert_allclose(found.velocity_m_s[0, :2], [10 * 1852 / 3600, 0.0], rtol=0, atol=1e-12)
         assert np.isnan(found.velocity_m_s[0, 2])
         # the ellipse of 3 and 1 cm lies with its long axis to the north-east
         values, axes = np.linalg.eigh(found.covariance_m2[0, :2, :2])
         np.testing.assert_allclose(np.sqrt(values), [0.01, 0.03], rtol=0.02)
-        np.testing.assert_allclose(np.abs(axes[:, 1]), [np.sqrt(0.5)] * 2, atol=1e-6)
+        np.testing.assert_allclose(np.abs(axes[:, 1]), [np.sqrt(0.5)] * 2, rtol=0, atol=1e-6)
         assert found.covariance_m2[0, 2, 2] == pytest.approx(0.04**2)
         assert found.sigma_source == "GST sentences"
 

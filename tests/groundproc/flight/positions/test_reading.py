@@ -106,11 +106,14 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 def test_poses_have_sigmas_and_what_lies_between_them(write: Callable[[bytes], Path]) -> None:
     found = read_solution(write(POSES.format(cross=0.01).encode()))
     assert found.point == "ins"
-    np.testing.assert_allclose(found.covariance_m2[0], [[0.01, 0.01, 0], [0.01, 0.04, 0], [0, 0, 0.09]], atol=1e-15)
+    np.testing.assert_allclose(
+        found.covariance_m2[0], [[0.01, 0.01, 0], [0.01, 0.04, 0], [0, 0, 0.09]], rtol=0, atol=1e-15
+    )
     assert found.attitude_covariance_rad2 is not None
     np.testing.assert_allclose(
         np.rad2deg(np.rad2deg(found.attitude_covariance_rad2[0])),
         [[0.01, 0, 0.01], [0, 0.01, 0], [0.01, 0, 0.04]],
+        rtol=0,
         atol=1e-12,
     )
     with pytest.raises(LogError, match="larger than the sigmas allow"):
@@ -134,11 +137,11 @@ def test_our_own_trajectory_comes_back(tmp_path: Path) -> None:
     found = read_solution(path, poses_height="msl")
     assert found.height_reference == "msl"
     np.testing.assert_allclose(
-        frame.from_geodetic(found.latitude_deg, found.longitude_deg, found.height_m), position, atol=2e-4
+        frame.from_geodetic(found.latitude_deg, found.longitude_deg, found.height_m), position, rtol=0, atol=2e-4
     )
-    np.testing.assert_allclose(found.sigma_m, 0.02, atol=1e-9)
+    np.testing.assert_allclose(found.sigma_m, 0.02, rtol=0, atol=1e-9)
     assert found.quat_place_ins_wxyz is not None
-    np.testing.assert_allclose(np.abs(np.sum(found.quat_place_ins_wxyz * quat, axis=1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.sum(found.quat_place_ins_wxyz * quat, axis=1)), 1.0, rtol=0, atol=1e-12)
 
 
 def test_a_sigma_below_zero_in_a_table_of_poses_is_named(write: Callable[[bytes], Path]) -> None:
