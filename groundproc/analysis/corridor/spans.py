@@ -45,7 +45,7 @@ _OWN_M: Final = 0.25
 """Points farther from all curves are of none."""
 _NEXT_M: Final = 0.5
 """A curve takes points so far beyond its ends: further on it meets others of its bundle."""
-_SAME_M: Final = 0.1
+SAME_M: Final = 0.1
 """Curves nearer to each other are one."""
 _WORST_M: Final = 0.12
 _JOIN_M: Final = 40.0
@@ -221,7 +221,7 @@ def settled(pieces: Sequence[Array]) -> list[Array]:
     for _ in range(_SETTLING):
         curves: list[Catenary] = []
         for curve, points in zip(map(fitted, whole), whole, strict=True):
-            if not any(np.median(_apart(each, points)) < _SAME_M for each in curves):
+            if not any(np.median(_apart(each, points)) < SAME_M for each in curves):
                 curves.append(curve)
         if not curves:
             return []

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from groundproc.analysis.corridor.catenary import Catenary, fitted
 from groundproc.analysis.corridor.clearance import Clearance
+from groundproc.analysis.corridor.spans import SAME_M
 
 Array = npt.NDArray[np.float64]
 
@@ -62,15 +63,30 @@ class Whole:
             self._thin()
 
     def fitted(self) -> list[Catenary]:
-        """All wires, in their order; one of which hardly a point was met as it was."""
+        """All wires, those that turn out to lie on each other as one; a wire of which hardly a point was met as it was."""
         self._thin()
         rows = np.concatenate([*self._kept, np.empty((0, 6))])
-        out = []
-        for number, wire in enumerate(self._wires):
-            mine = _without_tips(rows[rows[:, 0] == number], wire)
-            on = mine[mine[:, 2] < _ON_M, 3:]
-            out.append(fitted(on) if len(on) >= _FEWEST else wire)
-        return out
+        numbers = list(range(len(self._wires)))
+        found = {number: self._fit(rows, number) for number in numbers}
+        for number in sorted(numbers, key=lambda each: found[each].length_m):
+            longer = [each for each in found if each != number and found[each].length_m >= found[number].length_m]
+            onto = next((each for each in longer if _same(found[number], found[each])), None)
+            if onto is not None:
+                del found[number]
+                rows[rows[:, 0] == number, 0] = onto
+                found[onto] = self._fit(rows, onto)
+        return [found[number] for number in numbers if number in found]
+
+    def _fit(self, rows: Array, number: int) -> Catenary:
+        """One wire by its rows."""
+        wire, mine = self._wires[number], rows[rows[:, 0] == number]
+        s, off, up = wire.local(mine[:, 3:])
+        mine[:, 1:3] = np.column_stack(
+            [s, np.hypot(off, up)]
+        )  # of the wire that they were met for, until two became one
+        mine = _without_tips(mine, wire)
+        on = mine[mine[:, 2] < _ON_M, 3:]
+        return _ended(fitted(on), on) if len(on) >= _FEWEST else wire
 
     def _thin(self) -> None:
         """Keep so many points of each metre, each with the same chance."""
@@ -83,6 +99,29 @@ class Whole:
         first = np.flatnonzero(np.append(True, (np.diff(metre, axis=0) != 0).any(axis=1)))
         rank = np.arange(len(rows)) - np.repeat(first, np.diff(np.append(first, len(rows))))
         self._kept, self._fresh = [rows[rank < _KEPT]], 0
+
+
+def _same(wire: Catenary, other: Catenary) -> bool:
+    """Whether a wire lies on a longer one."""
+    s, off, up = other.local(wire.places(1.0))
+    within = (s > other.start_m - 1.0) & (s < other.end_m + 1.0)
+    return bool(np.median(np.where(within, np.hypot(off, up), np.inf)) < SAME_M)
+
+
+def _ended(wire: Catenary, xyz_m: Array) -> Catenary:
+    """A wire that ends where its points do: noise carries the outermost of many beyond the end, of few it lies short of it.
+
+    Points of one density up to an end, each off by a normal error, have 0.4 of what there is within one sigma beyond it. The outermost has
+    ln 2 of a point beyond it, the next one more, as a median.
+    """
+    s, _, _ = wire.local(xyz_m)
+    sigma_m = wire.rms_m / np.sqrt(2.0)
+    off = []
+    for inwards in (np.sort(s - s.min()), np.sort(s.max() - s)):
+        to_the_metre = np.count_nonzero(inwards < 1.0)
+        place = sigma_m / np.sqrt(2.0 * np.pi) * to_the_metre - np.log(2.0)
+        off.append(np.interp(place, np.arange(len(inwards)), inwards) if place > 0.0 else place / to_the_metre)
+    return wire.between(float(s.min() + off[0]), float(s.max() - off[1]))
 
 
 def _without_tips(rows: Array, wire: Catenary) -> Array:
