@@ -67,11 +67,15 @@ def test_local_coordinates_are_the_textbooks(
     latitude: float, longitude: float, height: float, step: tuple[float, float, float]
 ) -> None:
     frame = LocalFrame(latitude, longitude, height)
-    place = tuple(np.array([v]) for v in (np.clip(latitude + step[0], -90, 90), longitude + step[1], height + step[2]))
-    local = frame.from_geodetic(*place)  # type: ignore[arg-type]
-    np.testing.assert_allclose(local, east_north_up((latitude, longitude, height), place), rtol=0, atol=1e-6)  # type: ignore[arg-type]
+    place = (
+        np.array([np.clip(latitude + step[0], -90, 90)]),
+        np.array([longitude + step[1]]),
+        np.array([height + step[2]]),
+    )
+    local = frame.from_geodetic(*place)
+    np.testing.assert_allclose(local, east_north_up((latitude, longitude, height), place), rtol=0, atol=1e-6)
     back = frame.to_geodetic(local)
-    np.testing.assert_allclose(earth_centred(*back), earth_centred(*place), rtol=0, atol=1e-5)  # type: ignore[arg-type]
+    np.testing.assert_allclose(earth_centred(*back), earth_centred(*place), rtol=0, atol=1e-5)
 
 
 def test_east_is_east_north_is_north_and_up_is_up() -> None:
