@@ -6,7 +6,6 @@ import os
 import platform
 import signal
 import sys
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from flightlog.constants import NS_PER_S
 from flightlog.errors import SwathError
 from flightlog.mount import Mount, load_mount
 from flightlog.records import ClockSync, HostClock
+from flightlog.stopflag import StopFlag
 from onboard import announce, health, healthreport, leftovers, logfolder, metrics, notify
 from onboard.announce import Announcer
 from onboard.autopilot import Link
@@ -59,7 +59,7 @@ class Daemon:
     settings : SwathdConfig
     config_path : Path
         Where they came from; a relative mount file is beside it.
-    stop : Event
+    stop : StopFlag
         Set it to end `run`; a signal handler may.
 
     Raises
@@ -68,7 +68,7 @@ class Daemon:
         A port is taken, the folder is not writable, the mount file is wrong.
     """
 
-    def __init__(self, settings: SwathdConfig, config_path: Path, stop: threading.Event) -> None:
+    def __init__(self, settings: SwathdConfig, config_path: Path, stop: StopFlag) -> None:
         mount = Mount() if settings.mount is None else load_mount(config_path.parent / settings.mount)
         started = read_clocks()
         self._log_time = LogTime.start(started)
@@ -312,7 +312,7 @@ def boot_id() -> str:
 
 def run(settings: SwathdConfig, config_path: Path) -> None:
     """Record until SIGTERM or SIGINT; see Daemon for the errors."""
-    stop = threading.Event()
+    stop = StopFlag()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         del number, frame

@@ -73,6 +73,7 @@ def _metres(text: str) -> float:
 def run(arguments: argparse.Namespace) -> int:
     """Work until SIGINT or SIGTERM, and leave everything whole."""
     from flightlog.errors import UsageError
+    from flightlog.stopflag import StopFlag
     from groundproc.commands.inputs import LOG, LOG_WORDS, expect, expect_text
     from groundproc.commands.outputs import claim_folder
     from groundproc.files import made_folder
@@ -91,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     expect([arguments.follow], (*LOG, "empty"), LOG_WORDS)  # one that is yet to be written into may be empty
     expect_text(arguments.mount, "a mount file (YAML)")
     claim_folder(arguments.output, ("trajectory_live.csv", "cloud_live.laz"), arguments.force)
-    over = threading.Event()
+    over = StopFlag()
 
     def end(number: int, frame: FrameType | None) -> None:
         over.set()

@@ -7,7 +7,6 @@ import contextlib
 import signal
 import sys
 import tempfile
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until SIGINT or SIGTERM."""
     from flightlog.errors import UsageError
+    from flightlog.stopflag import StopFlag
     from groundproc.commands.outputs import claim_file
     from groundproc.viewer.server import ViewServer
 
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     cloud, paths = _chosen(arguments.cloud)
     if arguments.edited is not None:
         claim_file(arguments.edited, (".laz", ".las"), arguments.force, [cloud])
-    over = threading.Event()
+    over = StopFlag()
 
     def end(number: int, frame: FrameType | None) -> None:
         over.set()

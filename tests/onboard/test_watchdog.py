@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from flightlog.stopflag import StopFlag
 from onboard import config
 from onboard.daemon import Daemon
 
@@ -58,7 +59,7 @@ def test_no_stroke_while_the_disk_holds_the_recorder_and_strokes_again_after(
         f"lidar: {{address: 127.0.0.1, data_port: 42368, position_port: 48308}}\nins: {{device: null}}\n"
         f"recorder: {{directory: {tmp_path}/logs, min_free_mb: 1}}\n"
     )
-    stop = threading.Event()
+    stop = StopFlag()
     daemon = Daemon(config.load(path), path, stop)
     thread = threading.Thread(target=daemon.run)
     thread.start()
