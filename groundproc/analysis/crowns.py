@@ -42,6 +42,10 @@ _WIRE_M: Final = 4.0
 """... and one of less is a stretch of wires, if thin lines are found so far around it ..."""
 _WIRES: Final = 0.7
 """... that this share of its points lies on."""
+_PLANE_M: Final = 0.08
+"""Points that scatter less about a plane are of no crown: of two wires side by side, or of a roof ..."""
+_PLANE_POINTS: Final = 10
+"""... if there are so many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +132,12 @@ def crowns(xyz_m: Array, above_m: npt.NDArray[np.float32], least_m: float) -> li
 def _thin(
     xyz_m: Array, above_m: npt.NDArray[np.float32], crown: npt.NDArray[np.int64], area: float, least_m: float
 ) -> bool:
-    """Whether a crown, by the numbers of its points, is a stretch of one wire or of several."""
+    """Whether a crown, by the numbers of its points, is a stretch of one wire or of several, or flat."""
     if len(crown) < 3:
         return False
+    # lines are not found among two wires that are nearer to each other than the voxels around a point reach
+    if len(crown) >= _PLANE_POINTS and np.linalg.eigvalsh(np.cov(xyz_m[crown].T))[0] < _PLANE_M**2:
+        return True
     wide, long = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(xyz_m[crown, :2].T)), 0.0))
     flat = np.column_stack([xyz_m[crown, :2], np.zeros(len(crown))])
     if _voxels(flat) * VOXEL_M**2 > _FULL * area and long < _LONG * wide:

@@ -93,6 +93,22 @@ def test_houses_and_wires_are_no_trees(tmp_path: Path) -> None:
     assert all(np.hypot(*(places - at).T).min() < 0.5 for at in trees)
 
 
+@pytest.mark.parametrize("apart", [(0.4, 0.0), (0.0, 0.4), (0.3, 0.3)], ids=["level", "upright", "aslant"])
+def test_two_wires_close_to_each_other_are_no_trees(tmp_path: Path, apart: tuple[float, float]) -> None:
+    """Bundled conductors, in which no single line is found; the tree beside them is."""
+    rng = np.random.default_rng(6)
+    ground = np.column_stack([rng.uniform(0, 60, 30_000), rng.uniform(0, 30, 30_000), np.zeros(30_000)])
+    along = rng.uniform(0, 1, (2, 900))
+    wires = [
+        np.column_stack([60 * u, 10 + 3 * u + k * apart[0], 8 + k * apart[1] + 5 * (u - 0.5) ** 2])
+        + rng.normal(0, 0.02, (900, 3))
+        for k, u in enumerate(along)
+    ]
+    tree = np.array([30.0, 22.0, 6.0]) + 1.5 * sphere(rng, 900) * (1, 1, 1.5)
+    found = listed(tmp_path, np.concatenate([ground, *wires, tree]))
+    assert [np.hypot(place[0] - 30.0, place[1] - 22.0) < 0.5 for place, _ in found] == [True]
+
+
 def sphere(rng: np.random.Generator, count: int) -> np.ndarray:
     """Points within a ball of radius 1, most of them near its rim."""
     way = rng.normal(size=(count, 3))
