@@ -29,10 +29,12 @@ _ADJUSTED_S: Final = 1_000_000_000
 
 def gps_time_s(utc_ns: Times) -> Array:
     """Adjusted standard GPS time [s] of Unix times [ns], shape (n,)."""
-    if not len(utc_ns):
-        return np.empty(0)
-    shift_ns = clock.utc_to_gps_ns(int(utc_ns[0])) - int(utc_ns[0]) - _ADJUSTED_S * NS_PER_S
-    return np.asarray((utc_ns + shift_ns) * 1e-9)
+    return np.asarray((utc_ns + gps_shift_ns(utc_ns)) * 1e-9)
+
+
+def gps_shift_ns(utc_ns: Times) -> int:
+    """What adjusted standard GPS time is ahead of Unix times, shape (n,), of one flight [ns]; 0 of none."""
+    return clock.utc_to_gps_ns(int(utc_ns[0])) - int(utc_ns[0]) - _ADJUSTED_S * NS_PER_S if len(utc_ns) else 0
 
 
 _FARTHEST_S: Final = 7e9

@@ -15,7 +15,7 @@ from numba import njit
 from flightlog import __version__
 from flightlog.errors import SourceError
 from groundproc.cloud.dimensions import BIT_FIELDS, Dimension, in_order
-from groundproc.cloud.gpstime import gps_time_s
+from groundproc.cloud.gpstime import gps_shift_ns
 from groundproc.cloud.points import Points
 
 SCALE_M: Final = 0.001
@@ -76,12 +76,12 @@ class Packer:
             A coordinate or an attribute lies beyond what its stored number can hold.
         """
         assert points.columns.keys() == {entry.name for entry in self._dimensions}, list(points.columns)
-        time_s = gps_time_s(points.time_ns) if self._gps else points.time_ns * 1e-9
+        shift_ns = gps_shift_ns(points.time_ns) if self._gps else 0
         number, returns = (points.columns.get(name) for name in BIT_FIELDS)
         one = np.ones(1, np.uint8)  # LAS counts from 1: an echo of which nothing is known is the only one
         place = tuple(out[name] for name in ("X", "Y", "Z", "gps_time", "bit_fields"))
         _pack_place(
-            points.xyz_m, time_s, one if number is None else number, one if returns is None else returns,
+            points.xyz_m, (points.time_ns, shift_ns), one if number is None else number, one if returns is None else returns,
             self._offset_m, place, self._limits, self._by_return,
         )  # fmt: skip
         if self._limits[0].min() < _INT32.min or self._limits[1].max() > _INT32.max:
@@ -156,21 +156,22 @@ def extra_bytes(entry: Dimension) -> laspy.ExtraBytesParams:
 
 @njit(cache=True, nogil=True)
 def _pack_place(
-    xyz_m: Any, time_s: Any, number: Any, returns: Any, offset_m: Any, out: Any, limits: Any, by_return: Any
+    xyz_m: Any, times: Any, number: Any, returns: Any, offset_m: Any, out: Any, limits: Any, by_return: Any
 ) -> None:
     """Fill place, time and returns; widen the limits of the stored coordinates, shape (2, 3), and count the returns, shape (16,).
 
-    Return numbers of shape (1,) hold for all points.
+    Times are in nanoseconds, with what is added to all of them. Return numbers of shape (1,) hold for all points.
     """
+    time_ns, shift_ns = times
     out_x, out_y, out_z, out_time, out_returns = out
     each_number, each_count = int(len(number) > 1), int(len(returns) > 1)
-    for i in range(len(time_s)):
+    for i in range(len(time_ns)):
         for axis, stored in ((0, out_x), (1, out_y), (2, out_z)):
             value = np.int64(np.rint((xyz_m[i, axis] - offset_m[axis]) * (1.0 / SCALE_M)))
             stored[i] = value
             limits[0, axis] = min(limits[0, axis], value)
             limits[1, axis] = max(limits[1, axis], value)
-        out_time[i] = time_s[i]
+        out_time[i] = (time_ns[i] + shift_ns) * 1e-9
         rank, count = min(number[i * each_number], 15), min(returns[i * each_count], 15)
         out_returns[i] = rank | count << 4
         by_return[rank] += 1

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.cloud import reader
+from groundproc.cloud.georeference import extent
 from groundproc.reporting.markup import Html, tag
 from groundproc.viewer.packing import pack
 from groundproc.viewer.page import held
@@ -128,13 +129,13 @@ def _packed(points: Thinned, shades: Sequence[Shade]) -> bytes:
 
 def origin(points: Thinned) -> Array:
     """Of the page's coordinates."""
-    return origin_of(points.xyz_m.min(axis=0), points.xyz_m.max(axis=0))
+    return origin_of(*extent(points.xyz_m))
 
 
 def element(part: CloudPart, text: str, paths: Sequence[Array]) -> Html:
     """The viewer, and what it shows."""
     points = part.points
-    limits = points.xyz_m.min(axis=0), points.xyz_m.max(axis=0)
+    limits = extent(points.xyz_m)
     spacing_m = points.spacing_m or float(np.sqrt(np.prod((limits[1] - limits[0])[:2]) / max(len(points), 1)))
     told = scene(origin(points), limits, points.xyz_m, part.shades, paths, spacing_m, part.crs)
     shown = f"{len(points):,} of {part.total:,} points" if len(points) < part.total else f"All {part.total:,} points"

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.cloud import reader
+from groundproc.cloud.georeference import extent
 from groundproc.cloud.nodes import NodeReader, is_copc, octree_of
 from groundproc.cloud.reader import Cloud
 from groundproc.machine.readahead import ahead
@@ -104,8 +105,9 @@ def thinner(points: Thinned, most: int) -> Thinned:
     """At most so many of some points."""
     if len(points) <= most:
         return points
-    low, high = 0.0, float(np.ptp(points.xyz_m, axis=0).max()) + 0.001
-    local = points.xyz_m - points.xyz_m.min(axis=0)
+    corner, far = extent(points.xyz_m)
+    low, high = 0.0, float((far - corner).max()) + 0.001
+    local = points.xyz_m - corner
     voxel_m = max(high / np.sqrt(most), points.spacing_m)
     best: tuple[npt.NDArray[Any], float] | None = None
     last, power = None, _SURFACE
