@@ -9,6 +9,7 @@ import importlib
 import queue
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final, TypeVar
 
 from groundproc.machine.system import cores
@@ -122,6 +123,33 @@ def beside(works: Sequence[Callable[[], object]]) -> None:
         thread.join()
     if errors:
         raise errors[0]
+
+
+class InOrder:
+    """Works done one after the other by a thread of its own while others go on; each at once where it is given, on one core.
+
+    It is used by one thread. A work's error comes where that is waited for.
+    """
+
+    def __init__(self) -> None:
+        self._pool = None if cores() == 1 else ThreadPoolExecutor(1, "in order")
+        self._last: Future[None] | None = None
+
+    def do(self, work: Callable[[], None]) -> "Future[None] | None":
+        """Have a work done after those before it, and what tells when it is done: None where it is already."""
+        if self._pool is None:
+            work()
+            return None
+        if self._last is not None and self._last.done():
+            self._last.result()  # its error, if nobody waits for it
+        self._last = self._pool.submit(work)
+        return self._last
+
+    def wait(self) -> None:
+        """Until all are done."""
+        last, self._last = self._last, None
+        if last is not None:
+            last.result()
 
 
 def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:

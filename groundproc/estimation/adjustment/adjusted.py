@@ -220,6 +220,7 @@ def adjust_run(
         if len(tracker.track) >= BEGINNING + AFTER and tracker.odometry is not None:
             tracker.odometry.turns = False  # only the map that the beginning is run again on goes by them
         if len(tracker.track) - begin >= WINDOW:
+            tracker.settle()
             _redo(tracker, motion, early)
             last = len(tracker.track)
             windows.append(

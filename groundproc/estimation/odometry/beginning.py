@@ -65,7 +65,7 @@ def redo_beginning(
         -track.gyro_bias[count - 1], state.accel_bias_m_s2.copy(), state.gravity_m_s2.copy(), np.diag(SIGMA**2),
     )  # fmt: skip
     line = None if before.line is None else before.line.reversed()
-    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line, turns)
+    odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line, turns, beside=True)
     odometry.map = _map_of(track, motion, count, min(count + AFTER, len(track)))
     found: dict[int, tuple[State, Step | None]] = {}
     for piece in reversed(early):
@@ -81,6 +81,7 @@ def redo_beginning(
     while odometry.number < count:
         odometry.propagate(odometry.number)
         found[count - odometry.number] = copy.deepcopy(odometry.state), None
+    odometry.settle()
     # where the planes do not hold it, it is no better than what was there
     if max(float(np.sqrt(np.diag(state.covariance)[3:6].max())) for state, _ in found.values()) > SURE_M:
         return

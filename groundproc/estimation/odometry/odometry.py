@@ -8,6 +8,9 @@ The state, and an error state of 18 components: attitude (in the body), position
 the accelerometer, gravity.
 """
 
+import functools
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,6 +26,7 @@ from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slic
 from groundproc.estimation.odometry.state import POSITION, ROTATION, STATES, STEP_S, VELOCITY, State, apply, propagate
 from groundproc.estimation.odometry.voxels import COUNT, MEAN, SCATTER, PlaneMap
 from groundproc.estimation.odometry.within import Seen, Within
+from groundproc.machine.readahead import InOrder
 from groundproc.numerics.rotations import mat_of_quat, quat_difference
 
 Array = npt.NDArray[np.float64]
@@ -72,6 +76,16 @@ class Step:
     quats: Array
 
 
+@dataclass(frozen=True, slots=True)
+class _Turns:
+    """What the turns within a slice are found of: see `Within`; `ground` is the ground's mean normal."""
+
+    seen: Seen
+    place_m: Array
+    turn: Array
+    ground: Array
+
+
 class Odometry:
     """The filter and its map.
 
@@ -88,12 +102,16 @@ class Odometry:
     turns : bool
         Whether the turns within slices are found (`within`). They are for who uses the attitudes of a step: neither the filter nor its
         map goes by them.
+    beside : bool
+        Whether what the filter does not wait for is done by a thread beside it: the turns within a slice, and its way into the map, while
+        the next one's clusters are made. The attitudes of a step are then stated when `settle` comes back.
 
     Attributes
     ----------
     state, number, voxel_m, line, turns
         As they are by now.
     map : PlaneMap
+        With all slices so far.
     """
 
     MOST: Final = 4000.0
@@ -102,11 +120,13 @@ class Odometry:
     """The map forgets what lies farther away than this."""
 
     def __init__(
-        self, state: State, motion: MotionGrid, number: int, voxel_m: float, line: Line | None = None, turns: bool = True
+        self, state: State, motion: MotionGrid, number: int, voxel_m: float, line: Line | None = None, turns: bool = True,
+        beside: bool = False,
     ) -> None:  # fmt: skip
         self.state, self.number, self.voxel_m, self.turns = state, number, voxel_m, turns
         self._motion = motion
-        self.map = PlaneMap(voxel_m)
+        self._map, self._mapped = PlaneMap(voxel_m), _done()
+        self._beside = InOrder() if beside else None
         self._cluster = Clusterer(voxel_m)
         self._ground = np.zeros(3)
         self.line = line if motion.source == LIDAR else None
@@ -119,6 +139,34 @@ class Odometry:
                 np.full(3, np.deg2rad(0.005) ** 2 * step), np.full(3, 0.002**2 * step), np.full(3, 1e-14),
             ]
         )  # fmt: skip
+
+    @property
+    def map(self) -> PlaneMap:
+        """The planes of all slices so far; waited for where they are put in beside."""
+        self._mapped.result()
+        return self._map
+
+    @map.setter
+    def map(self, planes: PlaneMap) -> None:
+        self.settle()
+        self._map = planes
+
+    def settle(self) -> None:
+        """Wait for what is done beside."""
+        if self._beside is not None:
+            self._beside.wait()
+
+    def afterwards(self, work: Callable[[PlaneMap], None]) -> None:
+        """Do a work with the map as it is after the last slice, and before the next; beside, where that is wanted."""
+        planes = self._map
+        self._do(lambda: work(planes))
+
+    def _do(self, work: Callable[[], None]) -> "Future[None]":
+        """Do a work, beside the filter where that is wanted."""
+        begun = None if self._beside is None else self._beside.do(work)
+        if self._beside is None:
+            work()
+        return begun or _done()
 
     def change_voxels(self, voxel_m: float) -> None:
         """Go on with voxels of another edge; the moments of the old ones go into the new."""
@@ -135,6 +183,7 @@ class Odometry:
         """Carry the state on to the end of slice `to`."""
         while self.number <= to:
             self._carry(*self._inertial(self.number))
+            self.settle()
             self._within.forget()
 
     def _inertial(self, number: int) -> tuple[Array, Array]:
@@ -164,12 +213,12 @@ class Odometry:
         clusters, world = self._cluster(piece, start_ns, quats, positions)
         s = self.state
         matched, residual, unheld = 0, float("nan"), (float("inf"), float("inf"))
+        # a column of a table is another type of array than one of one row, and what takes it compiles for half a minute
+        returns, turns = np.ascontiguousarray(clusters["count"]), None
         if self.map.count:
             # in the body at the slice's end, where the prediction between the instants stands
             before, end_m = _mat(s.quat), s.position_m.copy()
             body = (world - end_m) @ before
-            # a column of a table is another type of array than one of one row, and what takes it compiles for half a minute
-            returns = np.ascontiguousarray(clusters["count"])
             matched, residual, unheld, s.covariance = update(
                 self.map.arrays, body, returns, s.arrays, s.covariance, self._ground
             )
@@ -179,19 +228,30 @@ class Odometry:
             quats = frames.quat_multiply(frames.quat_from_mat(turn[None]), quats)
             if self.turns or piece.laser is not None:
                 seen = Seen(clusters["time_ns"] - start_ns, world, returns)
-                within = self._within(seen, positions, turn, (self.map.arrays, self._ground))
-                quats = frames.quat_multiply(frames.quat_exp(within), quats)
-        self.map.insert(world, clusters, self.MOST)
+                turns = _Turns(seen, positions, turn, self._ground.copy())
+        far_m = s.position_m.copy() if piece.number % 50 == 0 else None
+        self._mapped = self._do(functools.partial(self._take_in, turns, quats, (world, clusters), far_m))
         count = len(clusters)
         if piece.laser is not None:
+            self._mapped.result()
             # these would weigh more in the filter, for each has a surface's roughness of its own
             clusters, world = self._cluster(piece, start_ns, quats, positions, apart=True)
-        if piece.number % 50 == 0:
-            self.map.forget_beyond(s.position_m, self.REACH_M)
         return Step(
             piece.number, s.quat.copy(), s.position_m.copy(), s.velocity_m_s.copy(), s.gyro_bias_rad_s.copy(),
             np.sqrt(np.diag(s.covariance)[:6]), clusters, world, count, matched, residual, *unheld, quats,
         )  # fmt: skip
+
+    def _take_in(
+        self, turns: "_Turns | None", quats: Array, seen: tuple[Array, npt.NDArray[np.void]], far_m: Array | None
+    ) -> None:
+        """Find the turns within a slice, by which its attitudes `quats` are changed, and put it into the map; `far_m`: forget what is far."""
+        world, clusters = seen
+        if turns is not None:
+            within = self._within(turns.seen, turns.place_m, turns.turn, (self._map.arrays, turns.ground))
+            quats[:] = frames.quat_multiply(frames.quat_exp(within), quats)
+        self._map.insert(world, clusters, self.MOST)
+        if far_m is not None:
+            self._map.forget_beyond(far_m, self.REACH_M)
 
     def position_fix(self, position_m: Array, sigma_m: Array) -> None:
         """Take a position of the sensor, shape (3,), with its sigmas."""
@@ -228,6 +288,13 @@ class Odometry:
 
     def _correct(self, error: Array) -> None:
         apply(error, self.state.arrays)
+
+
+def _done() -> "Future[None]":
+    """A work that has been done."""
+    done: Future[None] = Future()
+    done.set_result(None)
+    return done
 
 
 def _mat(quat: Array) -> Array:

@@ -121,6 +121,11 @@ class Tracker:
             self._restart(odometry, astray=True)
         return step
 
+    def settle(self) -> None:
+        """Wait for what is done beside the odometry: the track's clusters and attitudes are complete then."""
+        if self.odometry is not None:
+            self.odometry.settle()
+
     def gyro_bias(self) -> Array:
         """The bias as known by now [rad/s], shape (3,)."""
         return self._bias if self.track is None or not self.track.gyro_bias else self.track.gyro_bias[-1]
@@ -138,7 +143,9 @@ class Tracker:
             return False
         self._range_m = _median_range(piece)
         voxel_m = _edge(self._range_m)
-        self.odometry = Odometry(state, self.motion, piece.number, voxel_m, Line() if self._in_time else None)
+        line = Line() if self._in_time else None
+        # who is told each pose as it comes would only wait for what is done beside
+        self.odometry = Odometry(state, self.motion, piece.number, voxel_m, line, beside=not self._in_time)
         self.track = Track(piece.number, [state.quat.copy()], [state.position_m.copy()], voxel_m=voxel_m)
         self._set_out(state, piece.number)
         return True
@@ -177,12 +184,23 @@ class Tracker:
         if step is None or not self.keep:
             track.clusters.append(NO_CLUSTERS)
         else:
-            track.clusters.append(thinned(step.clusters, step.world_m, odometry.map, KEPT))
+            self._keep(step, odometry, len(track.clusters))
         self._rejoining.note(odometry, track.matched[-1], track.next_unheld_m[-1])
         track.apart = self._rejoining.left + len(self._rejoining.lost)
         now_ns = self._now_ns(odometry)
         if now_ns > self._begin_ns:
             self._history.add(now_ns, track.position_m[-1], track.quat[-1])
+
+    def _keep(self, step: Step, odometry: Odometry, number: int) -> None:
+        """Keep a slice's clusters for the batch: those of the last slice, by its number in the track."""
+        assert self.track is not None
+        kept = self.track.clusters
+        kept.append(NO_CLUSTERS)
+
+        def thin(planes: PlaneMap) -> None:
+            kept[number] = thinned(step.clusters, step.world_m, planes, KEPT)
+
+        odometry.afterwards(thin)
 
     # What the autopilot states --------------------------------------------------------------------------------------
 
@@ -319,6 +337,7 @@ def tracked(tracker: Tracker) -> Track:
     LogError
         Not enough of them could be placed.
     """
+    tracker.settle()
     track = tracker.track
     if track is None or len(track) < FEWEST:
         raise LogError(
