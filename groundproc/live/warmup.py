@@ -34,9 +34,9 @@ def warm_up() -> None:
     for number, seen in enumerate((floor, floor, floor, floor[:1], floor[:0])):
         times = number * SLICE_NS + np.linspace(0, SLICE_NS - 1, len(seen)).astype(np.int64)
         odometry.step(Slice(number, times, seen))
-    surfaces = surfaces_of(odometry.map, np.zeros(3), 100.0)
+    surfaces = surfaces_of(odometry.planes, np.zeros(3), 100.0)
     starts(surfaces, surfaces, np.zeros(3), np.ones(4))
-    odometry.map.forget_beyond(np.zeros(3), 100.0)
+    odometry.planes.forget_beyond(np.zeros(3), 100.0)
     quat = integrated(rest[:STEPS], state.quat)
     cloud = VoxelCloud(1.0, 1 << 20)
     cloud.add(

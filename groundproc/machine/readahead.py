@@ -8,6 +8,7 @@ import contextlib
 import importlib
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final, TypeVar
@@ -128,28 +129,27 @@ def beside(works: Sequence[Callable[[], object]]) -> None:
 class InOrder:
     """Works done one after the other by a thread of its own while others go on; each at once where it is given, on one core.
 
-    It is used by one thread. A work's error comes where that is waited for.
+    It is used by one thread. A work's error comes where it is waited for, or where a later one is given.
     """
 
     def __init__(self) -> None:
         self._pool = None if cores() == 1 else ThreadPoolExecutor(1, "in order")
-        self._last: Future[None] | None = None
+        self._given: deque[Future[None]] = deque()
 
     def do(self, work: Callable[[], None]) -> "Future[None] | None":
         """Have a work done after those before it, and what tells when it is done: None where it is already."""
         if self._pool is None:
             work()
             return None
-        if self._last is not None and self._last.done():
-            self._last.result()  # its error, if nobody waits for it
-        self._last = self._pool.submit(work)
-        return self._last
+        while self._given and self._given[0].done():
+            self._given.popleft().result()
+        self._given.append(self._pool.submit(work))
+        return self._given[-1]
 
     def wait(self) -> None:
         """Until all are done."""
-        last, self._last = self._last, None
-        if last is not None:
-            last.result()
+        while self._given:
+            self._given.popleft().result()
 
 
 def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:

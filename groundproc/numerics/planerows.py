@@ -27,8 +27,8 @@ HUBER: Final = 2.0
 """Sigmas beyond which a residual loses weight."""
 CUT: Final = 5.0
 """Sigmas beyond which a cluster is none of this plane: moving things, mixed echoes."""
-PIECE: Final = 1 << 17
-"""Rows that are made or changed at a time, about, where what it takes is larger than they are."""
+PIECE: Final = 1 << 16
+"""Rows that are made or changed at a time by each core, about, where what it takes is larger than they are."""
 PARTS: Final = 8
 """Pieces that the voxels are shared out in between cores."""
 _NOTHING: Final = np.empty(0)

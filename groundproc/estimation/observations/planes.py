@@ -15,6 +15,7 @@ from groundproc.estimation.observations.told import Poses, keep_told
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path, PathArrays
+from groundproc.numerics.parts import at_once
 from groundproc.numerics.planeproducts import RowArrays
 from groundproc.numerics.planerows import PlaneRows
 from groundproc.numerics.planes import Placed, VoxelPlanes, find_planes, scatter_along
@@ -32,6 +33,8 @@ RANGE_SIGMA_M: Final = 0.02
 """Noise of a return (data sheet); what a voxel's own residuals show comes on top."""
 ROUGHNESS_M: Final = 0.006
 """Roughness of a surface before its residuals tell, one sigma of a cluster [m]."""
+_FEW: Final = 20_000
+"""Clusters that are placed before a second thread has begun."""
 
 Columns = LaserColumns | RetimingColumn | SpinColumns
 
@@ -167,11 +170,15 @@ def rows_of(
         np.empty((len(starts) - 1, 6)), kept, path.intervals,
     )  # fmt: skip
     variance = np.empty(n)
-    for some in rows.pieces():
-        _fill(rows, some, clusters, path, (normals, means), variance, voxel_m)
+    pieces = list(rows.pieces())
+
+    def fill(at: int, into: Array = variance) -> None:
+        _fill(rows, pieces[at], clusters, path, (normals, means), into, voxel_m)
+
+    at_once(fill, len(pieces))
     rows.plane[flat:], variance[flat:] = 0.0, of_leaves  # they have no tilts
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
-    del variance, of_leaves
+    del variance, of_leaves, fill
 
     def poses(part: slice) -> Poses:
         some = _of(clusters, kept[part])
@@ -249,7 +256,16 @@ def _place_all(clusters: Clusters, path: Path, turns: bool = True) -> _Located:
     out = _Located(
         np.empty((count, 3)), np.empty((turned, 9), np.float32), np.empty(count, np.int32), np.empty((turned, 4), np.float32)
     )  # fmt: skip
-    _place(clusters.time_ns, clusters.xyz_m, path.arrays, out)
+    if count < _FEW:
+        _place(clusters.time_ns, clusters.xyz_m, path.arrays, out)
+        return out
+
+    def place(half: int) -> None:
+        part = slice(half * count // 2, (half + 1) * count // 2)
+        some = _Located(out.world_m[part], out.rotation[part], out.knot[part], out.weights[part])
+        _place(clusters.time_ns[part], clusters.xyz_m[part], path.arrays, some)
+
+    at_once(place, 2)
     return out
 
 

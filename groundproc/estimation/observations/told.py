@@ -16,7 +16,9 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from groundproc.estimation.odometry.matching import FACING_VOXELS, GROUND, INFLATION, RELIEF, TELLS_M, observable
 from groundproc.estimation.odometry.tracker import SURE_HELD_M
+from groundproc.machine.readahead import ahead
 from groundproc.numerics.facing import mean_normals
+from groundproc.numerics.parts import at_once
 from groundproc.numerics.planeproducts import RowArrays
 from groundproc.numerics.planerows import PlaneRows
 
@@ -81,10 +83,14 @@ def keep_told(
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     base, more, judged = np.zeros((3, rows.intervals, 6, 6))
     normal, unsure = _facing(rows, flat, place_m, voxel_m)
-    for piece in rows.pieces():
-        few, (of, part) = rows.some(piece), piece
-        seen = poses(part)
-        level, relief = _parts(few, seen, normals, flat - part.start)
+
+    def parts(piece: tuple[slice, slice]) -> tuple[RowArrays, Poses, tuple[Singles, Singles]]:
+        few, seen = rows.some(piece), poses(piece[1])
+        return few, seen, _parts(few, seen, normals, flat - piece[1].start)
+
+    pieces = list(rows.pieces())
+    # sums are taken in the order of the rows, whatever is made ahead
+    for (of, _), (few, seen, (level, relief)) in zip(pieces, ahead(map(parts, pieces)), strict=True):
         _blocks(few.knot, level, few.weight, base)
         _blocks(few.knot[: len(relief)], relief, few.weight, more)
         _face(few, seen, len(relief), (normal[of], unsure[of]), level, judged)
@@ -97,9 +103,12 @@ def keep_told(
     affected = np.trace(known, axis1=1, axis2=2) < TOLD
     share = shares_of_relief(base, more)
     share[affected] = 0.0
-    for piece in rows.pieces():
-        few, seen = rows.some(piece), poses(piece[1])
-        _take(few, (known, share), _parts(few, seen, normals, flat - piece[1].start), seen.rotation)
+
+    def take(at: int) -> None:
+        few, seen, both = parts(pieces[at])
+        _take(few, (known, share), both, seen.rotation)
+
+    at_once(take, len(pieces))
     blind = affected & (known[:, 2, 2] < 0.5)
     if blind.any():
         weaker = np.ones(rows.intervals)

@@ -66,7 +66,7 @@ def redo_beginning(
     )  # fmt: skip
     line = None if before.line is None else before.line.reversed()
     odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line, turns, beside=True)
-    odometry.map = _map_of(track, motion, count, min(count + AFTER, len(track)))
+    odometry.planes = _map_of(track, motion, count, min(count + AFTER, len(track)))
     found: dict[int, tuple[State, Step | None]] = {}
     for piece in reversed(early):
         k = piece.number - track.first
@@ -95,7 +95,7 @@ def redo_beginning(
         # all of a slice's clusters again, for the old ones were made with a wrong motion
         clusters = seen.clusters.copy()
         clusters["time_ns"] = end_ns - clusters["time_ns"]
-        track.clusters[k] = thinned(clusters, seen.world_m, odometry.map, KEPT)
+        track.clusters[k] = thinned(clusters, seen.world_m, odometry.planes, KEPT)
         track.matched[k], track.residual_m[k] = seen.matched, seen.residual_m
         track.unheld_m[k], track.next_unheld_m[k] = seen.unheld_m, seen.next_unheld_m
 

@@ -110,8 +110,8 @@ class Odometry:
     ----------
     state, number, voxel_m, line, turns
         As they are by now.
-    map : PlaneMap
-        With all slices so far.
+    planes : PlaneMap
+        The map, with all slices so far.
     """
 
     MOST: Final = 4000.0
@@ -141,13 +141,13 @@ class Odometry:
         )  # fmt: skip
 
     @property
-    def map(self) -> PlaneMap:
-        """The planes of all slices so far; waited for where they are put in beside."""
+    def planes(self) -> PlaneMap:
+        """The map of all slices so far; waited for where they are put in beside."""
         self._mapped.result()
         return self._map
 
-    @map.setter
-    def map(self, planes: PlaneMap) -> None:
+    @planes.setter
+    def planes(self, planes: PlaneMap) -> None:
         self.settle()
         self._map = planes
 
@@ -170,14 +170,14 @@ class Odometry:
 
     def change_voxels(self, voxel_m: float) -> None:
         """Go on with voxels of another edge; the moments of the old ones go into the new."""
-        before, self.voxel_m = self.map, voxel_m
+        before, self.voxel_m = self.planes, voxel_m
         rows = before.voxels[: before.count]
         clusters = np.zeros(before.count, CLUSTER_DTYPE)
         clusters["count"], clusters["scatter"] = rows[:, COUNT], rows[:, SCATTER : SCATTER + 6]
-        self.map, self._cluster = PlaneMap(voxel_m), Clusterer(voxel_m)
+        self.planes, self._cluster = PlaneMap(voxel_m), Clusterer(voxel_m)
         for first in range(0, before.count, 10_000):
             part = slice(first, first + 10_000)
-            self.map.insert(rows[part, MEAN : MEAN + 3].copy(), clusters[part], self.MOST)
+            self.planes.insert(rows[part, MEAN : MEAN + 3].copy(), clusters[part], self.MOST)
 
     def propagate(self, to: int) -> None:
         """Carry the state on to the end of slice `to`."""
@@ -215,12 +215,12 @@ class Odometry:
         matched, residual, unheld = 0, float("nan"), (float("inf"), float("inf"))
         # a column of a table is another type of array than one of one row, and what takes it compiles for half a minute
         returns, turns = np.ascontiguousarray(clusters["count"]), None
-        if self.map.count:
+        if self.planes.count:
             # in the body at the slice's end, where the prediction between the instants stands
             before, end_m = _mat(s.quat), s.position_m.copy()
             body = (world - end_m) @ before
             matched, residual, unheld, s.covariance = update(
-                self.map.arrays, body, returns, s.arrays, s.covariance, self._ground
+                self.planes.arrays, body, returns, s.arrays, s.covariance, self._ground
             )
             # the slice is corrected as one rigid piece
             turn = _mat(s.quat) @ before.T
@@ -244,7 +244,7 @@ class Odometry:
     def _take_in(
         self, turns: "_Turns | None", quats: Array, seen: tuple[Array, npt.NDArray[np.void]], far_m: Array | None
     ) -> None:
-        """Find the turns within a slice, by which its attitudes `quats` are changed, and put it into the map; `far_m`: forget what is far."""
+        """Turn a slice's attitudes `quats` by the turns within it, and put it into the map; `far_m`: forget what is far from there."""
         world, clusters = seen
         if turns is not None:
             within = self._within(turns.seen, turns.place_m, turns.turn, (self._map.arrays, turns.ground))

@@ -122,10 +122,10 @@ class Rejoining:
             self.lost[-1].sigma = np.maximum(self.lost[-1].sigma, now)
         elif self._loose >= LOOSE and self._held >= WORTH and now[:3].max() > ASTRAY_M:
             begin = self._count - self._loose
-            lost = [*self.lost, Before(odometry.map, begin, self._count, now)]
+            lost = [*self.lost, Before(odometry.planes, begin, self._count, now)]
             self.left += max(len(lost) - KEPT, 0)
             self.lost = lost[-KEPT:]
-            odometry.map = PlaneMap(odometry.voxel_m)
+            odometry.planes = PlaneMap(odometry.voxel_m)
             self._held = 0
 
     def sigma(self) -> Array:
@@ -149,7 +149,7 @@ class Rejoining:
         if self._count < self._next and not far:
             return None
         self._tried_m = place.copy()
-        mine = surfaces_of(odometry.map, place, RADIUS_M)
+        mine = surfaces_of(odometry.planes, place, RADIUS_M)
         sigma = np.zeros(4)
         for before in reversed(self.lost):
             sigma = np.hypot(sigma, before.sigma)
@@ -180,11 +180,11 @@ class Rejoining:
         if not self._in_time:
             offset, stretch = len(track) - self._count, self.lost[-1]
             laid_track(track, stretch.begin + offset, stretch.end + offset, found)
-        planes, odometry.map = odometry.map, before.planes
-        if odometry.map.voxel_m != odometry.voxel_m:
-            odometry.map = PlaneMap(odometry.voxel_m)
-            merge(before.planes, odometry.map)
-        merge(planes, odometry.map, found)
+        planes, odometry.planes = odometry.planes, before.planes
+        if odometry.planes.voxel_m != odometry.voxel_m:
+            odometry.planes = PlaneMap(odometry.voxel_m)
+            merge(before.planes, odometry.planes)
+        merge(planes, odometry.planes, found)
         # pieces between the two stay where they are
         number = self.lost.index(before)
         self.left += len(self.lost) - number - 1

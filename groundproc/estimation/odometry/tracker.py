@@ -273,7 +273,7 @@ class Tracker:
         assert self.track is not None
         state = self._state_at(odometry.number)
         if state is not None:
-            odometry.state, odometry.map = state, PlaneMap(odometry.voxel_m)
+            odometry.state, odometry.planes = state, PlaneMap(odometry.voxel_m)
             self.track.restarts += 1
             self.track.astray += astray
             self._rejoining.forget()

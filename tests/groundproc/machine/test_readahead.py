@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from groundproc.machine import readahead, system
-from groundproc.machine.readahead import ahead, beside, both, imported_meanwhile
+from groundproc.machine.readahead import InOrder, ahead, beside, both, imported_meanwhile
 
 
 @pytest.fixture(autouse=True)
@@ -162,6 +162,47 @@ def test_an_interrupt_of_the_first_lets_one_work_end_and_begins_no_other() -> No
         beside([first, *(functools.partial(other, number) for number in range(many))])
     assert begun == ended, "the one that was being done is whole"
     assert len(begun) < many
+
+
+def test_works_in_order_are_done_by_one_thread_while_others_go_on() -> None:
+    works, done = InOrder(), []
+    go_on = threading.Event()
+
+    def first() -> None:
+        go_on.wait()
+        done.append(threading.current_thread())
+
+    begun = works.do(first)
+    works.do(lambda: done.append(threading.current_thread()))
+    assert begun is not None
+    assert not begun.done(), "it waits for what this thread does next"
+    go_on.set()
+    begun.result()
+    works.wait()
+    assert len(done) == 2
+    assert done[0] is done[1] is not threading.current_thread()
+
+
+def test_an_error_of_a_work_in_order_is_not_lost_behind_one_that_does_well() -> None:
+    works, go_on = InOrder(), threading.Event()
+
+    def failing() -> None:
+        go_on.wait()
+        raise ValueError("it cannot be done")
+
+    works.do(failing)
+    works.do(go_on.is_set)  # type: ignore[arg-type] # what it gives is of no use
+    go_on.set()
+    with pytest.raises(ValueError, match="cannot be done"):
+        works.wait()
+
+
+def test_on_one_core_works_in_order_are_done_where_they_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readahead, "cores", lambda: 1)
+    works, done = InOrder(), []
+    assert works.do(lambda: done.append(threading.current_thread())) is None
+    assert done == [threading.current_thread()]
+    works.wait()
 
 
 def test_two_works_give_what_they_give() -> None:

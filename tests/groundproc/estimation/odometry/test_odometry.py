@@ -139,10 +139,28 @@ def test_without_the_turns_within_slices_all_but_the_attitudes_stated_of_a_step_
         for name in ("quat", "position_m", "velocity_m_s", "gyro_bias_rad_s", "sigma", "clusters", "world_m"):
             np.testing.assert_array_equal(getattr(seen, name), getattr(bare, name))
         stated.append(np.abs(seen.quats - bare.quats).max())
-    first, second = (each.map.voxels[: each.map.count] for each in both)
+    first, second = (each.planes.voxels[: each.planes.count] for each in both)
     np.testing.assert_array_equal(first, second)
     assert stated[0] == 0.0, "there is no map yet"
     assert min(stated[1:]) > 0.0
+
+
+def test_what_is_done_beside_the_filter_gives_the_same_to_the_bit() -> None:
+    """Attitudes of a step, and its way into the map, are waited for where they are asked for."""
+    plain, beside = (Odometry(start(), motion(), 0, 0.5, beside=each) for each in (False, True))
+    kept: list[list[int]] = [[], []]
+    for number in range(6):
+        seen, also = (each.step(piece(number, room, 0.02)) for each in (plain, beside))
+        for each, counts in zip((plain, beside), kept, strict=True):
+            each.afterwards(lambda planes, counts=counts: counts.append(planes.count))  # type: ignore[misc] # of this turn
+        for name in ("quat", "position_m", "sigma", "clusters", "world_m"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(also, name))
+        beside.settle()
+        np.testing.assert_array_equal(seen.quats, also.quats)
+    assert kept[0] == kept[1]
+    np.testing.assert_array_equal(
+        plain.planes.voxels[: plain.planes.count], beside.planes.voxels[: beside.planes.count]
+    )
 
 
 def test_over_an_infinite_plane_nothing_is_learnt_of_place_and_heading() -> None:

@@ -68,9 +68,9 @@ def noted(track: Track, place_m: Array) -> None:
 @pytest.fixture(scope="module")
 def flown() -> Any:
     """Forty slices that hold, ten that do not, and a piece that lies elsewhere, until it is found."""
-    filter_ = SimpleNamespace(state=state(np.zeros(3), 0.01), map=PlaneMap(0.5), voxel_m=0.5)
+    filter_ = SimpleNamespace(state=state(np.zeros(3), 0.01), planes=PlaneMap(0.5), voxel_m=0.5)
     odometry: Any = filter_
-    filled(odometry.map, yard(1))
+    filled(odometry.planes, yard(1))
     watch, start = Rejoining(in_time=False), np.array([1.0, 0.0, 0.0, 0.0])
     track = Track(0, [start], [np.zeros(3)])
     for _ in range(WORTH + 10):
@@ -83,7 +83,7 @@ def flown() -> Any:
     assert len(watch.lost) == 1
     off = TURN.inv()
     odometry.state = state(off.apply(-SHIFT_M), 0.01)
-    filled(odometry.map, off.apply(yard(2) - SHIFT_M))
+    filled(odometry.planes, off.apply(yard(2) - SHIFT_M))
     found = None
     for _ in range(30):
         noted(track, odometry.state.position_m)
@@ -129,9 +129,9 @@ def test_second_moments_turn_with_their_axes() -> None:
 
 def test_a_path_that_may_be_centimetres_off_keeps_its_map() -> None:
     """Its planes are met."""
-    odometry: Any = SimpleNamespace(state=state(np.zeros(3), 0.1), map=PlaneMap(0.5), voxel_m=0.5)
-    watch, before = Rejoining(in_time=False), odometry.map
+    odometry: Any = SimpleNamespace(state=state(np.zeros(3), 0.1), planes=PlaneMap(0.5), voxel_m=0.5)
+    watch, before = Rejoining(in_time=False), odometry.planes
     for matched in [500] * (WORTH + 1) + [0] * 20:
         watch.note(odometry, matched, 0.01 if matched else np.inf)
-    assert odometry.map is before
+    assert odometry.planes is before
     assert not watch.lost
