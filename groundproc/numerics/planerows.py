@@ -57,7 +57,7 @@ class PlaneRows:
         Distance from the voxel's mean plane.
     inverse : ndarray, shape (voxels, 6)
         Inverse of each plane's normal matrix: 00 01 02 11 12 22.
-    cluster : ndarray of int64, shape (n,)
+    cluster : ndarray of int32, shape (n,)
         Where each row's cluster stands.
     intervals : int
         Of the spline.
@@ -71,7 +71,7 @@ class PlaneRows:
     weight: Array
     residual_m: Array
     inverse: Array
-    cluster: Ints
+    cluster: npt.NDArray[np.int32]
     intervals: int
 
     def __len__(self) -> int:

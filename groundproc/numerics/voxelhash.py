@@ -8,6 +8,8 @@ from numba import njit
 
 Array = npt.NDArray[np.float64]
 
+_FIRST_VOXELS: Final = 1 << 16
+"""Voxels that a numbering begins with room for."""
 _CELLS_A_POINT: Final = 2.0
 """Cells that points are sorted by, at most: most of a larger area is empty, and counting it would take longer than its points."""
 
@@ -30,14 +32,53 @@ def spread(key: Any) -> Any:
 
 
 def assign(world_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.int32], int]:
-    """Number of the voxel of each point, and how many voxels there are."""
-    voxel, _, voxels = numbered(world_m, 1.0 / voxel_m, table_for(4 * len(world_m)))
-    return voxel, int(voxels)
+    """Number of the voxel of each point, in the order in which they first come, and how many voxels there are."""
+    # most points share a voxel: a table for as many voxels as points is larger than they are, and outside the cache
+    voxel, keys = np.empty(len(world_m), np.int32), np.empty(_FIRST_VOXELS, np.int64)
+    table, at, found = table_for(2 * len(keys)), 0, 0
+    while True:
+        at, found = _number(world_m, 1.0 / voxel_m, (at, found), keys, table, voxel)
+        if at == len(world_m):
+            return voxel, int(found)
+        keys = np.concatenate([keys, np.empty_like(keys)])
+        table = table_for(2 * len(keys))
+        _enter(keys[:found], table)
 
 
 def table_for(slots: int) -> npt.NDArray[np.int32]:
     """An empty table with room for so many voxels and more."""
     return np.full(1 << int(np.ceil(np.log2(max(slots, 1 << 10)))), -1, np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _number(
+    xyz: Any, per_m: float, begin: tuple[int, int], keys: Any, table: npt.NDArray[np.int32], voxel: npt.NDArray[np.int32]
+) -> Any:  # fmt: skip
+    """Number points from one on, with so many voxels found before: the point where there is no room for a voxel more, and the voxels by then."""
+    mask, (first, found) = len(table) - 1, begin
+    for n in range(first, len(xyz)):
+        key = voxel_key(xyz[n, 0], xyz[n, 1], xyz[n, 2], per_m)
+        slot = spread(key) & mask
+        while table[slot] >= 0 and keys[table[slot]] != key:
+            slot = (slot + 1) & mask
+        if table[slot] < 0:
+            if found == len(keys):
+                return n, found
+            table[slot], keys[found] = found, key
+            found += 1
+        voxel[n] = table[slot]
+    return len(xyz), found
+
+
+@njit(cache=True, nogil=True)
+def _enter(keys: npt.NDArray[np.int64], table: npt.NDArray[np.int32]) -> None:
+    """Put voxels into an empty table, by their numbers."""
+    mask = len(table) - 1
+    for number in range(len(keys)):
+        slot = spread(keys[number]) & mask
+        while table[slot] >= 0:
+            slot = (slot + 1) & mask
+        table[slot] = number
 
 
 @njit(cache=True, nogil=True)

@@ -119,6 +119,7 @@ class Batch:
         That is done once, after the first step: done again and again, the path would follow the inertial units and their noise seem to
         vanish.
         """
+        give_back_memory()
         unknowns = self.unknowns()
         state = self.state(learn)
         rows, (factors, figures) = both(

@@ -190,8 +190,10 @@ def noise_of(
     strain: Mapping[str, Array] = NONE_STRAINED,
 ) -> Noise:
     """The sources of errors about a solution `x` of a problem that is linear about `path`; where no gyro carries it, none between knots."""
-    step = np.clip((clusters.time_ns - path.start_ns) // path.step_ns, 0, len(path.quat) - 2).astype(np.int32)
-    step = step[rows.cluster]
+    step = np.empty(len(rows), np.int32)
+    for _, part in rows.pieces():
+        since = (clusters.time_ns[rows.cluster[part]] - path.start_ns) // path.step_ns
+        step[part] = np.clip(since, 0, len(path.quat) - 2)
     mats = frames.mat_from_quat(path.quat)
     inside = step[rows.first[:-1]]
     place = np.einsum("nij,nj->ni", mats[inside], clusters.xyz_m[rows.cluster[rows.first[:-1]]])

@@ -25,6 +25,8 @@ ENOUGH_OF_DRAWS: Final = 1e-3
 ENOUGH_OF_COLUMNS: Final = 3e-3
 """Share that may be missing: of a draw, as a share of all that it moves; of a column of the inverse, of the variance
 that it stands for."""
+AT_ONCE: Final = 1 << 16
+"""Numbers of each column of a covariance that are multiplied at once."""
 LEVER_M: Final = 10.0
 """How a turn counts against a shift where a path's own rigid part is told from it."""
 
@@ -150,10 +152,15 @@ class Posterior:
             if place in whole:  # with what the path's coefficients have of it
                 rights[: common.shape[1], i] = common[int(np.flatnonzero(whole == place)[0])]
         solved = self.problem.solve_all(rights, 0.0, ENOUGH_OF_COLUMNS)
-        seen = np.empty((len(places), sum(self.noise.sizes)))
+        # hundreds of thousands of numbers for each global: they are kept in single precision, and multiplied in double
+        seen = np.empty((len(places), sum(self.noise.sizes)), np.float32)
         for i, column in enumerate(np.ascontiguousarray(solved.T)):
             seen[i] = self.noise.seen(column)
-        return np.asarray(seen @ seen.T)
+        found = np.zeros((len(places), len(places)))
+        for begin in range(0, seen.shape[1], AT_ONCE):
+            some = seen[:, begin : begin + AT_ONCE].astype(np.float64)
+            found += some @ some.T
+        return found
 
     def datum(self) -> Array:
         """Covariance of the shift and of the turn about the origin that all of a path shares, shape (6, 6).

@@ -18,6 +18,7 @@ from groundproc.estimation.observations.planes import Rows
 from groundproc.estimation.observations.rows import Factor, Unknowns, normal_equations
 from groundproc.estimation.odometry.spline import Path
 from groundproc.machine.readahead import both
+from groundproc.numerics.planeproducts import ABREAST
 
 Array = npt.NDArray[np.float64]
 
@@ -108,7 +109,10 @@ class Problem:
         return x, MOST_STEPS
 
     def solve_all(self, rights: Array, enough: float = ENOUGH, share: float = 0.0) -> Array:
-        """`solve` of several right sides, shape (unknowns, m), each by itself and all side by side: the rows are read once for all."""
+        """`solve` of several right sides, shape (unknowns, m), each by itself and four side by side: the rows are read once for these."""
+        if rights.shape[1] > ABREAST:
+            groups = [rights[:, i : i + ABREAST] for i in range(0, rights.shape[1], ABREAST)]
+            return np.concatenate([self.solve_all(some, enough, share) for some in groups], axis=1)
         found = np.zeros_like(rights)
         going = np.arange(rights.shape[1])
         x, r = np.zeros_like(rights), rights.copy()
@@ -149,7 +153,7 @@ def problem(rows: Rows, factors: Sequence[Factor], unknowns: Unknowns, deflation
     """Set a step up, linear about a path."""
     normal, gradient = normal_equations(factors)
     gradient[: rows.size] += rows.gradient() / deflation
-    by_row = normal.tocsr()
+    by_row = normal.T  # it is symmetric: the same arrays, by rows
     fine, coarse = both(lambda: _fine(rows, normal, deflation), lambda: coarse_of(rows, deflation, by_row, path))
     found = Problem(rows, deflation, by_row, gradient, fine, coarse)
     wide = [sparse.diags(1.0 / each.sigma) @ each.matrix for each in factors if each.wide]
@@ -201,8 +205,8 @@ def _sparse_corner(corner: Array, start: int, size: int) -> sparse.csc_matrix:
 def _sparse_band(band: Array, size: int) -> sparse.csc_matrix:
     """Blocks, shape (intervals, 4, 4, 6, 6), at the coefficients of each interval."""
     intervals = len(band)
-    start = 6 * np.arange(intervals)
+    start = 6 * np.arange(intervals, dtype=np.int32)
     i, j, a, b = np.meshgrid(np.arange(4), np.arange(4), np.arange(6), np.arange(6), indexing="ij")
-    row = start[:, None] + (6 * i + a).ravel()
-    column = start[:, None] + (6 * j + b).ravel()
+    row = start[:, None] + (6 * i + a).ravel().astype(np.int32)
+    column = start[:, None] + (6 * j + b).ravel().astype(np.int32)
     return sparse.csc_matrix((band.reshape(intervals, -1).ravel(), (row.ravel(), column.ravel())), shape=(size, size))

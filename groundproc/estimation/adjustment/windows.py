@@ -32,7 +32,7 @@ from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import LIDAR, Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
-from groundproc.machine.system import give_back_memory
+from groundproc.machine.system import give_back_memory, large_blocks_given_back
 from groundproc.trajectory.covariance import SIZE
 
 Array = npt.NDArray[np.float64]
@@ -161,6 +161,7 @@ class Seen:
     kept: dict[str, Any] = field(default_factory=dict)
 
 
+@large_blocks_given_back()
 def adjust_window(
     track: Track, motion: Motion, sources: Sources, first: int, last: int, before: Sequence[Window], *, more: bool,
     told: Callable[[], None] = lambda: None,

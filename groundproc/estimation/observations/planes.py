@@ -101,12 +101,18 @@ class Rows(PlaneRows):
         self.more, self.border, self.corner = [lasers], border, corner
 
     def with_retiming(self, turning: Array, time_ns: Ints, path: Path) -> None:
-        """Take the delay of the gyro in, after the lasers: what the path turns by for it, and the times of each row's cluster."""
-        self._with(retiming_column(self.jacobian, turning, time_ns, path))
+        """Take the delay of the gyro in, after the lasers: what the path turns by for it, and the times of the clusters."""
+        value = np.empty(len(self), np.float32)
+        for _, part in self.pieces():
+            value[part] = retiming_column(self.jacobian[part], turning, time_ns[self.cluster[part]], path).value
+        self._with(RetimingColumn(value))
 
     def with_spin(self, xyz_m: Singles) -> None:
-        """Take the line of the spin in, after these: each row's cluster in the sensor frame."""
-        self._with(spin_columns(self.jacobian, xyz_m))
+        """Take the line of the spin in, after these: the clusters in the sensor frame."""
+        circle = np.empty((len(self), 2), np.float32)
+        for _, part in self.pieces():
+            circle[part] = spin_columns(self.jacobian[part], xyz_m[self.cluster[part]]).circle
+        self._with(SpinColumns(self.jacobian[:, :3], circle))
 
     def _with(self, columns: "RetimingColumn | SpinColumns") -> None:
         path, before = self.path_size, len(self.corner)
@@ -156,7 +162,7 @@ def rows_of(
     keep = _choose(first, order, knot, planes, path.intervals, most)
     leaves = filled_rows(first, order, seen, voxel_m, planes.good, path.intervals, filled)
     flat = len(keep)
-    kept = np.concatenate([order[keep], leaves.cluster])
+    kept = np.concatenate([order[keep], leaves.cluster], dtype=np.int32)
     good = np.repeat(np.arange(voxels, dtype=np.int32), np.diff(first))[keep]
     at = np.flatnonzero(np.diff(good, prepend=np.int32(-1)))
     starts = np.concatenate([at, flat + leaves.first]).astype(np.int64)
@@ -192,9 +198,9 @@ def rows_of(
             in_sensor[part] = np.einsum("nji,nj->ni", poses(part).rotation.reshape(-1, 3, 3), facing)
         rows.with_lasers(clusters.laser[kept], clusters.xyz_m[kept], in_sensor)
     if turning is not None:
-        rows.with_retiming(turning, clusters.time_ns[kept], path)
+        rows.with_retiming(turning, clusters.time_ns, path)
     if spin:
-        rows.with_spin(clusters.xyz_m[kept])
+        rows.with_spin(clusters.xyz_m)
     return rows
 
 
@@ -215,7 +221,7 @@ def _fill(
     _linearise(rows.some(some), seen, Poses(rotation, few.xyz_m), normals, variance[part])
 
 
-def _of(clusters: Clusters, which: Ints) -> Clusters:
+def _of(clusters: Clusters, which: Knots) -> Clusters:
     """Some clusters, by their numbers; without their lasers."""
     return Clusters(clusters.time_ns[which], clusters.xyz_m[which], clusters.scatter_m2[which], clusters.count[which])
 

@@ -129,7 +129,7 @@ class SpinColumns:
     def column(self, number: int) -> Array:
         """The rows by one unknown, shape (n,)."""
         axis, part = divmod(number, 2)
-        return self.turning[:, axis].astype(np.float64) * self.circle[:, part]
+        return np.multiply(self.turning[:, axis], self.circle[:, part], dtype=np.float64)
 
     def along(self, value: Array) -> Array:
         """The rows times the unknowns, shape (6,): shape (n,)."""

@@ -91,7 +91,9 @@ class PlaneMap:
 
     def _grow(self) -> None:
         self.keys = np.concatenate([self.keys, np.empty_like(self.keys)])
-        self.voxels = np.concatenate([self.voxels, np.zeros_like(self.voxels)])
+        voxels = np.empty((2 * len(self.voxels), COLUMNS))  # what is not written takes no memory yet
+        voxels[: self.count] = self.voxels[: self.count]
+        self.voxels = voxels
         self.table = np.empty(2 * len(self.table), np.int32)
         self._index()
 
