@@ -54,7 +54,7 @@ def table_for(slots: int) -> npt.NDArray[np.int32]:
 def _number(
     xyz: Any, per_m: float, begin: tuple[int, int], keys: Any, table: npt.NDArray[np.int32], voxel: npt.NDArray[np.int32]
 ) -> Any:  # fmt: skip
-    """Number points from one on, with so many voxels found before: the point where there is no room for a voxel more, and the voxels by then."""
+    """Number points from one on, so many voxels being known: the point where there is no room for one more, and the voxels by then."""
     mask, (first, found) = len(table) - 1, begin
     for n in range(first, len(xyz)):
         key = voxel_key(xyz[n, 0], xyz[n, 1], xyz[n, 2], per_m)

@@ -1,6 +1,7 @@
 """What systems do differently, and what is installed beside us."""
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -39,3 +40,35 @@ def test_linear_algebra_takes_one_thread_unless_it_is_told_otherwise(given: str 
     program = "import sys, groundproc, os; assert 'numpy' not in sys.modules; print(os.environ['OPENBLAS_NUM_THREADS'])"
     told = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert told.stdout.split() == [expected]
+
+
+RESIDENT = """
+import contextlib, sys
+import numpy as np
+from groundproc.machine.system import large_blocks_given_back
+
+def resident_mb():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096 / 1e6
+
+np.ones(3_500_000)  # glibc takes all that is smaller from its heap from now on
+with large_blocks_given_back() if sys.argv[1] == "given back" else contextlib.nullcontext():
+    before = resident_mb()
+    blocks = [np.ones(1_000_000) for _ in range(20)]
+    kept = blocks[-1]
+    del blocks
+    print(resident_mb() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries hold what is free in other ways")
+def test_large_blocks_go_back_to_the_system_when_they_are_freed() -> None:
+    """Twenty of 8 MB, the last of which stays: what lies below it in the heap would stay too."""
+    left_mb = {
+        case: float(
+            subprocess.run([sys.executable, "-c", RESIDENT, case], capture_output=True, text=True, check=True).stdout
+        )
+        for case in ("given back", "as it is")
+    }
+    assert left_mb["as it is"] > 100.0
+    assert left_mb["given back"] < 16.0

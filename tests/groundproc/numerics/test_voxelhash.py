@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from groundproc.numerics.voxelhash import row_by_row
+from groundproc.numerics.voxelhash import assign, row_by_row
 
 
 def test_rows_of_cells_from_the_corner() -> None:
@@ -27,3 +27,15 @@ def test_areas_that_are_mostly_empty_take_wider_cells(size_m: tuple[float, float
     assert (np.sort(row_by_row(xy, 0.01)) == np.arange(1_000)).all()
     assert not len(row_by_row(xy[:0], 1.0))
     assert row_by_row(xy[:1], 1.0).tolist() == [0]
+
+
+@pytest.mark.parametrize(("points", "across_m"), [(0, 1.0), (1, 1.0), (5_000, 2.0), (300_000, 40.0)])
+def test_voxels_are_numbered_as_they_first_come(points: int, across_m: float) -> None:
+    """However many there are: the last case has more than the numbering begins with room for."""
+    xyz = np.random.default_rng(5).uniform(-across_m, across_m, (points, 3))
+    voxel, voxels = assign(xyz, 1.0)
+    _, begins, of_point = np.unique(np.floor(xyz).astype(int), axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(begins), int)
+    rank[np.argsort(begins)] = np.arange(len(begins))
+    assert voxels == len(begins)
+    assert (voxel == rank[of_point.ravel()]).all()
