@@ -112,7 +112,8 @@ class Noise:
     def seen(self, vector: Array) -> Array:
         """S^T times a vector of unknowns: what each of the independent numbers does to the linear function that it stands for."""
         patches, _, _, _ = self.sizes
-        by_row = self.rows.seen(vector[: self.rows.size]) / self.deflation
+        by_row = self.rows.seen(vector[: self.rows.size])
+        by_row /= self.deflation
         grid = self.follow.shape[0]
         signs, in_body = np.zeros(patches), np.zeros((grid, 3))
         _collect(self.rows.jacobian, by_row, self.step, self.off_m, self.patch, in_body, signs)

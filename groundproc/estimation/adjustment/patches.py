@@ -91,10 +91,9 @@ def coarse(path: Path) -> Path:
 
 def patches_of(gathered: Clusters, path: Path, window: int) -> Patches:
     """Patches of a window's clusters where its path places them."""
-    world = places(gathered, path)
     chunk = (gathered.time_ns - path.start_ns) // (SLICE_NS * CHUNK)
     edges = np.searchsorted(chunk, np.arange(chunk[-1] + 2)) if len(chunk) else np.zeros(1, np.int64)
-    parts = [_merged(gathered, world, slice(int(first), int(last))) for first, last in pairwise(edges) if last > first]
+    parts = [_merged(gathered, path, slice(int(first), int(last))) for first, last in pairwise(edges) if last > first]
     none = np.zeros(0)
     time_ns, place, scatter, count, draw = (
         (np.concatenate([part[i] for part in parts]) for i in range(5)) if parts else (none, none.reshape(0, 3), none, none, none)
@@ -134,9 +133,12 @@ class _Merged(NamedTuple):
     draw: Array
 
 
-def _merged(gathered: Clusters, world: Array, chunk: slice) -> tuple[npt.NDArray[Any], ...]:
+def _merged(gathered: Clusters, path: Path, chunk: slice) -> tuple[npt.NDArray[Any], ...]:
     """Time, place, scatter, returns and draw of the patches of a chunk."""
-    place = world[chunk]
+    place = places(
+        Clusters(gathered.time_ns[chunk], gathered.xyz_m[chunk], gathered.scatter_m2[chunk], gathered.count[chunk]),
+        path,
+    )
     voxel, voxels = assign(place, PATCH_M)
     order, first = sorted_by(voxel, voxels)
     out = _Merged(

@@ -100,7 +100,8 @@ class Posterior:
     def noise(self) -> Noise:
         """Where errors come from."""
         if self._noise is None:
-            self._noise = self.find_noise()
+            found = self._noise = self.find_noise()
+            self.find_noise = lambda: found  # what it was found from goes: clusters, and the other observations' rows
         return self._noise
 
     def figures(self) -> dict[str, float]:

@@ -27,6 +27,7 @@ from groundproc.estimation.observations.observation import Observation, Stretch
 from groundproc.estimation.observations.rows import H, Unknowns
 from groundproc.estimation.observations.spin import spin_of
 from groundproc.estimation.observations.tie import Tie
+from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import LIDAR, Motion
@@ -198,27 +199,30 @@ def adjust_window(
     give_back_memory()
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
-    spread = posterior.spread(DRAWS)
     batch.log[-1] |= posterior.figures()
-    unknowns = batch.unknowns()
-    (values, exact), seen = _values(unknowns, posterior, spread, sources.exact), None
+    unknowns, said, seen = batch.unknowns(), batch.said(), None
+    if before or more:
+        frame = coarse(batch.path)
+        kept = {each.name: each.keep(batch.state(), frame) for each in observations}
+        patches = patches_of(lidar.clusters, batch.path, len(before))
+    lidar.clusters = Clusters.none()  # what is left to do takes the rows alone, and much more
+    give_back_memory()
+    spread = posterior.spread(DRAWS)
+    values, exact = _values(unknowns, posterior, spread, sources.exact)
     corrections, datum, solved = None, posterior.datum(), posterior.unknowns
     if sources.lasers_apart:
         corrections = lidar.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
     del posterior  # and all rows with it
     give_back_memory()
     if before or more:
-        stiffness = stiffness_of(batch.path, solved, spread.whole)
-        frame = coarse(batch.path)
-        kept = {each.name: each.keep(batch.state(), frame) for each in observations}
-        seen = Seen(patches_of(lidar.clusters, batch.path, len(before)), stiffness, kept)
+        seen = Seen(patches, stiffness_of(batch.path, solved, spread.whole), kept)
         # how the whole lies is asked for when all windows are joined
         spread = spread.without([solved.names[name] for name in ("world.turn", "world.shift")])
     skew_rad = misalignment_rad(values, mat) if "ins.turn" in values else 0.0
     errors = _errors(batch.path, solved, spread, mat, lever, (motion.rate_density, skew_rad))
     return Window(
         first, last, last - first, batch.path, values, unknowns, errors.sigma_position_m, errors.sigma_attitude_rad,
-        batch.log, exact, corrections, batch.said(), seen, errors.correlation,
+        batch.log, exact, corrections, said, seen, errors.correlation,
         carried_density(observations, motion.rate_density), datum, loops.closed, loops.apart,
     )  # fmt: skip
 

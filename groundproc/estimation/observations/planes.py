@@ -89,7 +89,7 @@ class Rows(PlaneRows):
         """The rows times a vector of unknowns, shape (n,)."""
         out, at = PlaneRows.along(self, vector[: self.path_size]), self.path_size
         for each in self.more:
-            out = out + each.along(vector[at : at + each.UNKNOWNS])
+            out += each.along(vector[at : at + each.UNKNOWNS])
             at += each.UNKNOWNS
         return out
 

@@ -28,5 +28,12 @@ class Clusters:
     count: npt.NDArray[np.int32]
     laser: npt.NDArray[np.int32] | None = None
 
+    @classmethod
+    def none(cls) -> "Clusters":
+        """Columns without rows, of no laser."""
+        return cls(
+            np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty((0, 6), np.float32), np.empty(0, np.int32)
+        )
+
     def __len__(self) -> int:
         return len(self.time_ns)
