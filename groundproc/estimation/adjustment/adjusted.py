@@ -4,6 +4,7 @@ packets --slices--> clusters --odometry--> path --batch--> path, mount, clocks, 
 packets, once more --fine--> the motion between the knots
 """
 
+import contextlib
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,6 +47,7 @@ from groundproc.estimation.odometry.stated import Recorded
 from groundproc.estimation.odometry.track import Track
 from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.flight.timeline import Leg
+from groundproc.machine.system import give_back_memory
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
@@ -176,6 +178,7 @@ def whole_run(
     if run.is_worse():
         part.rest("adjust")
         return run
+    give_back_memory()
     corrected = replace(given, corrections=run.lasers(given.corrections, len(given.lidar.lasers)))
     pieces = slices(corrected, run.motion.start_ns, Part(progress, REFINING))
     density = float(np.mean([window.density for window in run.windows]))
@@ -223,14 +226,16 @@ def adjust_run(
             tracker.settle()
             _redo(tracker, motion, early)
             last = len(tracker.track)
-            windows.append(
-                adjust_window(tracker.track, motion, sources, begin, last, windows, more=True, told=pace.stepped)
-            )
+            with contextlib.nullcontext() if tracker.odometry is None else tracker.odometry.map.set_aside():
+                windows.append(
+                    adjust_window(tracker.track, motion, sources, begin, last, windows, more=True, told=pace.stepped)
+                )
             pace.caught_up()
             begin = last - OVERLAP
             windows[-1].own = begin - windows[-1].first
     track = tracked(tracker)
     _redo(tracker, motion, early)
+    tracker.odometry = None  # and its map
     if not windows or len(track) - begin > OVERLAP:
         windows.append(adjust_window(track, motion, sources, begin, len(track), windows, more=False, told=pace.stepped))
     else:

@@ -168,8 +168,9 @@ def _fine(rows: Rows, normal: sparse.csc_matrix, deflation: float) -> Factorisat
     band = _sparse_band(rows.band() * (SHARE / deflation), size)
     if rows.more:
         band = band + _sparse_corner(rows.corner / deflation, rows.path_size, size)
+    band = (normal + band).tocsc()
     found: Factorisation = splu(
-        (normal + band).tocsc(), options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
+        band, options={"SymmetricMode": True}, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
     )
     return found
 

@@ -1,5 +1,8 @@
 """A map of planes: second moments of the returns in each voxel of a hash that grows."""
 
+import contextlib
+import tempfile
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -88,6 +91,24 @@ class PlaneMap:
         self.keys[:count], self.voxels[:count] = self.keys[: self.count][kept], rows[kept]
         self.count = count
         self._index()
+
+    @contextlib.contextmanager
+    def set_aside(self) -> Iterator[None]:
+        """Have the voxels, a hundred megabytes, in a file while nobody asks for them; where a file has no room, they stay."""
+        count, rows = self.count, len(self.voxels)
+        with tempfile.TemporaryFile() as file:
+            try:
+                file.write(self.voxels[:count].data)
+                file.seek(0)
+            except OSError:
+                yield
+                return
+            self.voxels = np.empty((0, COLUMNS))
+            try:
+                yield
+            finally:
+                self.voxels = np.empty((rows, COLUMNS))
+                file.readinto(self.voxels[:count].data)
 
     def _grow(self) -> None:
         self.keys = np.concatenate([self.keys, np.empty_like(self.keys)])

@@ -109,6 +109,23 @@ def test_a_voxel_forgets_what_is_beyond_its_memory() -> None:
     assert voxel[MEAN] == pytest.approx(0.8, abs=1e-3)
 
 
+def test_a_map_that_was_set_aside_goes_on_as_it_was() -> None:
+    """It takes what comes, and has room for what it had room for."""
+    rng = np.random.default_rng(6)
+    kept, aside = PlaneMap(0.5), PlaneMap(0.5)
+    for _ in range(3):
+        world = rng.uniform(-40.0, 40.0, (40_000, 3))
+        clusters = np.zeros(len(world), CLUSTER_DTYPE)
+        clusters["count"] = 5
+        for each in (kept, aside):
+            each.insert(world, clusters, 4000.0)
+        with aside.set_aside():
+            assert not len(aside.voxels)
+    assert aside.count == kept.count
+    assert len(aside.voxels) == len(kept.voxels)
+    np.testing.assert_array_equal(aside.voxels[: aside.count], kept.voxels[: kept.count])
+
+
 def test_the_map_grows_and_forgets_what_is_far_away() -> None:
     """300,000 voxels, more than the first table holds; half of them are dropped, and every other is found again."""
     rng = np.random.default_rng(5)
