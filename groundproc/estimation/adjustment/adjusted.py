@@ -226,7 +226,7 @@ def adjust_run(
             tracker.settle()
             _redo(tracker, motion, early)
             last = len(tracker.track)
-            with contextlib.nullcontext() if tracker.odometry is None else tracker.odometry.map.set_aside():
+            with contextlib.nullcontext() if tracker.odometry is None else tracker.odometry.planes.set_aside():
                 windows.append(
                     adjust_window(tracker.track, motion, sources, begin, last, windows, more=True, told=pace.stepped)
                 )
