@@ -84,7 +84,7 @@ def refined(path: Path, pieces: Iterable[Slice], grid_ns: int, density: float, v
             if not clusters:
                 first = at
             last = at + STEPS + 1
-            planes.insert(world, found, Odometry.MOST)
+            planes.insert(world, found, Odometry.MOST, judged=False)
             clusters.append(found[["time_ns", "xyz", "count"]].copy())
     if clusters:
         _turn(path, slice(first, last), turns, clusters, planes, density)
@@ -111,6 +111,7 @@ def _turn(
 ) -> None:
     """Find the turns of a part of the grid; its first goes on from what the part before found there, if that was next to it."""
     part = Path(path.start_ns + here.start * STEP_NS, path.quat[here], path.position_m[here])
+    planes.judge()
     diagonal, beside = gyro_information(part.quat, density)
     pull = np.zeros((len(part.quat), 3))
     if turns[here.start].any():

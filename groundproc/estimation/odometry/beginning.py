@@ -110,5 +110,6 @@ def _map_of(track: Track, motion: Motion, first: int, last: int) -> PlaneMap:
         place = np.clip((clusters["time_ns"] - path.start_ns) // STEP_NS, 0, len(path.quat) - 1)
         mats = frames.mat_from_quat(path.quat[place])
         world = np.einsum("nij,nj->ni", mats, clusters["xyz"].astype(np.float64)) + path.position_m[place]
-        planes.insert(world, clusters, Odometry.MOST)
+        planes.insert(world, clusters, Odometry.MOST, judged=False)
+    planes.judge()
     return planes

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from groundproc.numerics.parts import at_once
 from groundproc.numerics.planes import add_scatter, flattest_of
 from groundproc.numerics.voxelhash import spread, voxel_key
 
@@ -72,11 +73,22 @@ class PlaneMap:
         self.voxels = np.zeros((1 << 16, COLUMNS))
         self.count = 0
 
-    def insert(self, world_m: Array, clusters: npt.NDArray[np.void], most: float) -> None:
-        """Add clusters whose means lie at `world_m`, shape (m, 3); a voxel forgets beyond `most` returns."""
+    def insert(self, world_m: Array, clusters: npt.NDArray[np.void], most: float, judged: bool = True) -> None:
+        """Add clusters whose means lie at `world_m`, shape (m, 3); a voxel forgets beyond `most` returns.
+
+        Where they are not `judged`, what the voxels hold by then is not looked at: `judge` does so when all are in.
+        """
         if self.count + len(world_m) > len(self.keys) or 2 * (self.count + len(world_m)) > len(self.table):
             self._grow()
-        self.count = _insert(self.arrays, self.count, world_m, clusters["scatter"], clusters["count"], most)
+        self.count = _insert(self.arrays, self.count, world_m, clusters["scatter"], clusters["count"], (most, judged))
+
+    def judge(self) -> None:
+        """Find planes, and what fills its voxel instead, in all voxels."""
+
+        def some(part: int) -> None:
+            _judge_all(self.voxels, part * self.count // 2, (part + 1) * self.count // 2, self.voxel_m)
+
+        at_once(some, 2)
 
     @property
     def arrays(self) -> MapArrays:
@@ -147,9 +159,12 @@ def find(table: Table, keys: Keys, key: int) -> Any:
 
 @njit(cache=True, nogil=True)
 def _insert(
-    planes: MapArrays, count: int, world: Array, scatter: npt.NDArray[np.float32], counts: npt.NDArray[np.int32], most: float
+    planes: MapArrays, count: int, world: Array, scatter: npt.NDArray[np.float32], counts: npt.NDArray[np.int32],
+    how: tuple[float, bool],
 ) -> int:  # fmt: skip
+    """`how`: returns that a voxel remembers, and whether it is judged."""
     table, keys, voxels, voxel_m = planes
+    most, judged = how
     mask, per_m = len(table) - 1, 1.0 / voxel_m
     normal, longest = np.empty(3), np.empty(3)
     for n in range(len(world)):
@@ -179,18 +194,34 @@ def _insert(
         v[MEAN + 1] += share * dy
         v[MEAN + 2] += share * dz
         add_scatter(v[SCATTER : SCATTER + 6], 1.0, scatter[n], weight, (dx, dy, dz))
-        v[FLATNESS], v[SPREAD] = -1.0, 0.0
-        if total >= FEWEST:
-            s = 1.0 / total
-            low, middle = flattest_of(v[SCATTER : SCATTER + 6], s, normal)
-            if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
-                v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
-                v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
-                v[FLATNESS] = max(low, 0.0)
-                v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
-            elif low > LEAST_SPREAD_M**2 and total >= FEWEST_SCATTERED:
-                largest, _ = flattest_of(v[SCATTER : SCATTER + 6], -s, longest)
-                for c in range(3):
-                    v[NORMAL + c], v[LONGEST + c] = normal[c], longest[c]
-                v[SPREAD], v[SPREAD + 1], v[SPREAD + 2] = low, middle, -largest
+        if judged:
+            _judge(v, voxel_m, normal, longest)
     return count
+
+
+@njit(cache=True, nogil=True)
+def _judge_all(voxels: Array, begin: int, end: int, voxel_m: float) -> None:
+    normal, longest = np.empty(3), np.empty(3)
+    for row in range(begin, end):
+        _judge(voxels[row], voxel_m, normal, longest)
+
+
+@njit(cache=True, nogil=True)
+def _judge(v: Array, voxel_m: float, normal: Array, longest: Array) -> None:
+    """Find what a voxel holds, from its moments; working memory (3,), (3,)."""
+    total = v[COUNT]
+    v[FLATNESS], v[SPREAD] = -1.0, 0.0
+    if total < FEWEST:
+        return
+    s = 1.0 / total
+    low, middle = flattest_of(v[SCATTER : SCATTER + 6], s, normal)
+    if low < FLATTEST_M**2 and middle > (NARROWEST * voxel_m) ** 2 and low < 0.2 * middle:
+        v[NORMAL], v[NORMAL + 1], v[NORMAL + 2] = normal[0], normal[1], normal[2]
+        v[LEVEL] = normal[0] * v[MEAN] + normal[1] * v[MEAN + 1] + normal[2] * v[MEAN + 2]
+        v[FLATNESS] = max(low, 0.0)
+        v[TILT] = max(low, LEAST_FLATNESS_M2) / (0.25 * min(total, MOST_RETURNS) * middle)
+    elif low > LEAST_SPREAD_M**2 and total >= FEWEST_SCATTERED:
+        largest, _ = flattest_of(v[SCATTER : SCATTER + 6], -s, longest)
+        for c in range(3):
+            v[NORMAL + c], v[LONGEST + c] = normal[c], longest[c]
+        v[SPREAD], v[SPREAD + 1], v[SPREAD + 2] = low, middle, -largest

@@ -6,7 +6,19 @@ import pytest
 
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE, Clusterer, Slice
-from groundproc.estimation.odometry.voxels import COUNT, FLATNESS, LEVEL, MEAN, NORMAL, SCATTER, PlaneMap, find
+from groundproc.estimation.odometry.voxels import (
+    COUNT,
+    FLATNESS,
+    LEVEL,
+    LONGEST,
+    MEAN,
+    NORMAL,
+    SCATTER,
+    SPREAD,
+    TILT,
+    PlaneMap,
+    find,
+)
 from groundproc.numerics.voxelhash import voxel_key
 
 Array = npt.NDArray[np.float64]
@@ -94,6 +106,28 @@ def test_what_is_no_plane_is_said_to_be_none() -> None:
     for points in (cube, few, line):
         planes.insert(points, singles(len(points)), 1e9)
         assert planes.voxels[row_at(planes, points[0]), FLATNESS] < 0
+
+
+def test_voxels_judged_once_at_the_end_are_as_those_judged_with_each_cluster() -> None:
+    """Ground, a wall, and leaves, in twenty slices; what a voxel holds is its moments' alone."""
+    rng = np.random.default_rng(7)
+    at_once, at_end = PlaneMap(0.5), PlaneMap(0.5)
+    for _ in range(20):
+        points = rng.uniform(-8.0, 8.0, (3000, 3))
+        points[:1000, 2] = rng.normal(0.2, 0.02, 1000)
+        points[1000:2000, 0] = rng.normal(5.2, 0.02, 1000)
+        points[2000:] = 2.0 + points[2000:] / 8.0
+        at_once.insert(points, singles(3000), 60.0)
+        at_end.insert(points, singles(3000), 60.0, judged=False)
+    at_end.judge()
+    first, last = (each.voxels[: each.count] for each in (at_once, at_end))
+    planes, filled = first[:, FLATNESS] >= 0.0, first[:, SPREAD] > 0.0
+    assert planes.sum() > 500
+    assert filled.sum() > 20
+    moments_and_verdict = [*range(COUNT, NORMAL), FLATNESS, SPREAD]
+    np.testing.assert_array_equal(first[:, moments_and_verdict], last[:, moments_and_verdict])
+    np.testing.assert_array_equal(first[planes, : TILT + 1], last[planes, : TILT + 1])
+    np.testing.assert_array_equal(first[filled, LONGEST:], last[filled, LONGEST:])
 
 
 def test_a_voxel_forgets_what_is_beyond_its_memory() -> None:
