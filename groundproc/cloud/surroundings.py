@@ -5,6 +5,7 @@ points. Beside an edge it is that of a flat neighbour; where points are sparse t
 none: leaves, wires, single points.
 """
 
+import functools
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from numba import njit
 
 from groundproc.cloud.voxels import MASK, VoxelMap, Voxels, beside, find, middle_of, place_of, signed
+from groundproc.machine.readahead import InOrder
 from groundproc.numerics.planes import flattest
 
 Array = npt.NDArray[np.float64]
@@ -68,6 +70,7 @@ class Surroundings(VoxelMap):
         super().__init__(edge_m, MOST + _PIECE)
         self.begin_ns: int | None = None
         self.levels: dict[int, Level] = {}
+        self._beside = InOrder()
 
     @property
     def full(self) -> bool:
@@ -75,16 +78,27 @@ class Surroundings(VoxelMap):
         return self.used > MOST
 
     def add(self, xyz_m: Array, time_ns: Times, origins_m: Array) -> None:
-        """Take points, shape (n, 3), with their times and the places of the sensor."""
+        """Take points, shape (n, 3), with their times and the places of the sensor.
+
+        Their voxels are found here, and their sums taken by a thread beside, in their order; `settle` waits for it.
+        """
         if self.begin_ns is None:
             self.begin_ns = int(time_ns[0])
         elapsed_ms = self.elapsed_ms(time_ns)
+        self.settle()  # points of one piece wait, and no more
         for begin in range(0, len(xyz_m), _SOME):
             some = slice(begin, begin + _SOME)
+            if self.used + _SOME > len(self.voxels.key):
+                self.settle()  # the sums are about to be copied
             self.make_room(len(xyz_m[some]))
-            self.used = int(
-                _add(xyz_m[some], elapsed_ms[some], origins_m[some], self.edge_m, self.table, self.voxels, self.used)
-            )
+            voxel = np.empty(len(xyz_m[some]), np.int32)
+            self.used = int(_number(xyz_m[some], self.edge_m, self.table, self.voxels.key, self.used, voxel))
+            seen = xyz_m[some], elapsed_ms[some], origins_m[some]
+            self._beside.do(functools.partial(_add, *seen, voxel, self.edge_m, self.voxels))
+
+    def settle(self) -> None:
+        """Wait until all points that were given are in the sums."""
+        self._beside.wait()
 
     def elapsed_ms(self, time_ns: Times) -> Times:
         """Times since the begin of the stretch."""
@@ -92,6 +106,7 @@ class Surroundings(VoxelMap):
 
     def find_planes(self) -> None:
         """Find the plane of each voxel: all points are there."""
+        self.settle()
         levels = {1: self._larger(self, None)}
         levels[2] = self._larger(*levels[1])
         for each in (self, levels[1].cubes, levels[2].cubes):
@@ -140,8 +155,8 @@ class Surroundings(VoxelMap):
 
 
 @njit(cache=True, nogil=True)
-def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels: Voxels, used: int) -> int:
-    keys, many, sums, when = voxels.key, voxels.many, voxels.sums, voxels.when_ms
+def _number(xyz: Any, edge_m: float, table: Any, keys: Any, used: int, voxel: Any) -> int:
+    """Say which voxel each point is in, new ones among them; gives how many there are. Cache misses of one run beside those of others."""
     per_m = 1.0 / edge_m
     for n in range(len(xyz)):
         i, j, k = np.floor(xyz[n, 0] * per_m), np.floor(xyz[n, 1] * per_m), np.floor(xyz[n, 2] * per_m)
@@ -149,6 +164,19 @@ def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels:
         v = place_of(key, table, keys, used)
         if v == used:
             used += 1
+        voxel[n] = v
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _add(xyz: Any, time_ms: Any, origin: Any, voxel: Any, edge_m: float, voxels: Voxels) -> None:
+    """Add points to the sums of their voxels."""
+    many, sums, when = voxels.many, voxels.sums, voxels.when_ms
+    per_m = 1.0 / edge_m
+    for n in range(len(xyz)):
+        i, j, k = np.floor(xyz[n, 0] * per_m), np.floor(xyz[n, 1] * per_m), np.floor(xyz[n, 2] * per_m)
+        v = voxel[n]
+        if many[v] == 0:
             when[v, 0], when[v, 1] = time_ms[n], time_ms[n] - LOOK_MS
         many[v] += 1
         if time_ms[n] - when[v, 1] >= LOOK_MS:
@@ -176,7 +204,6 @@ def _add(xyz: Any, time_ms: Any, origin: Any, edge_m: float, table: Any, voxels:
             s[7] += y * y
             s[8] += y * z
             s[9] += z * z
-    return used
 
 
 @njit(cache=True, nogil=True, inline="always")

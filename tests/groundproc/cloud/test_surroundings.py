@@ -101,6 +101,7 @@ def test_room_for_more_voxels_is_made_without_losing_any() -> None:
     made = Surroundings()
     for some in np.array_split(xyz, 9):
         made.add(np.ascontiguousarray(some), START_NS + np.arange(len(some)), np.tile(SENSOR, (len(some), 1)))
+    made.settle()
     cells = np.unique(np.floor(xyz / made.edge_m).astype(int), axis=0)
     assert made.used == len(cells)
     assert int(made.voxels.many[: made.used].sum()) == len(xyz)
