@@ -15,7 +15,7 @@ from groundproc.estimation.inertial.smoother import solve
 from groundproc.estimation.inertial.solution import Solution
 from groundproc.estimation.legs import leg_by_leg
 from groundproc.estimation.method import Given, Method, Progress
-from groundproc.estimation.observations.outside import shared
+from groundproc.estimation.observations.outside import delay_sigma_s, shared
 from groundproc.estimation.observations.states import (
     ATTITUDE,
     COMPASS,
@@ -70,7 +70,7 @@ def filtered_estimate(given: Given, progress: Progress, outside: Sequence[Outsid
         solution = solve_leg(given, leg, fixes, outside)
         reports.append({"boot": leg.boot.number, "lidar_run": leg.run} | report(solution))
         warnings.extend(_warnings(solution))
-        return trajectory_in(given.frame, solution)
+        return trajectory_in(given.frame, solution, late_sigma_s(solution, leg))
 
     trajectory = leg_by_leg(given, of_leg)
     return Estimate(trajectory, given.mount, SIGMA_SOURCE, report={"legs": reports}, warning="; ".join(warnings))
@@ -100,9 +100,27 @@ def solve_leg(given: Given, leg: Leg, fixes: PositionFixes, outside: Sequence[Ou
     return solve(readings, given=given, leg=leg)
 
 
-def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
-    """The trajectory of a solution, with the covariance of its poses; `frame` is that of its readings."""
-    covariance = pose_covariance(solution)
+def late_sigma_s(solution: Solution, leg: Leg) -> float:
+    """How well the lidar's clock is known to show the UTC of the outside positions in a solution [s]; without any, 0.
+
+    Poses of an earlier estimate of the same log are on its clocks.
+    """
+    strange = any(len(fixes) and fixes.tied is None for fixes in solution.readings.outside)
+    return delay_sigma_s(leg.utc) if strange else 0.0
+
+
+def trajectory_in(frame: LocalFrame, solution: Solution, late_s: float = 0.0) -> Trajectory:
+    """The trajectory of a solution, with the covariance of its poses.
+
+    Parameters
+    ----------
+    frame : LocalFrame
+        That of its readings.
+    solution : Solution
+    late_s : float
+        By how much the whole may be late, one sigma: it is off by so much of its way.
+    """
+    covariance = pose_covariance(solution, late_s)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     kept_s = (solution.kept_ns - solution.time_ns[0]) * 1e-9
     nodes_s = (solution.time_ns - solution.time_ns[0]) * 1e-9
@@ -121,13 +139,15 @@ def trajectory_in(frame: LocalFrame, solution: Solution) -> Trajectory:
     )
 
 
-def pose_covariance(solution: Solution) -> Array:
+def pose_covariance(solution: Solution, late_s: float = 0.0) -> Array:
     """Covariance of east, north, up [m], roll, pitch, heading [rad] at the kept times, shape (k, 6, 6)."""
     row = np.searchsorted(solution.time_ns, solution.kept_ns)
     heading, pitch, _ = frames.attitude_of(frames.mat_from_quat(solution.quat[row]))
     states = np.r_[POSITION : POSITION + 3, ATTITUDE : ATTITUDE + 3]
     covariance = solution.covariance[:, states[:, None], states].astype(np.float64)
     covariance += shared(solution.readings.outside, solution.kept_ns)
+    way = late_s * solution.velocity_m_s[row]
+    covariance[:, :3, :3] += way[:, :, None] * way[:, None, :]
     # a small turn in the local frame as changes of roll, pitch, heading
     to_angles = np.tile(np.eye(SIZE), (len(row), 1, 1))
     to_angles[:, 3:, 3:] = mat_attitude_turn(heading, pitch)

@@ -111,9 +111,14 @@ def outside_track(fixes: OutsideFixes, mat_ins_lidar: Array, lidar_m: Array, utc
         tau_s,
         fixes.quat_local_ins_wxyz if known else None,
         fixes.attitude_covariance_rad2 if known else None,
-        float(np.hypot(utc.sigma_ns * 1e-9, LEAST_DELAY_SIGMA_S if utc.source == "gprmc" else BY_BOOT_SIGMA_S)),
+        delay_sigma_s(utc),
         fixes.cross_covariance_m_rad if known else None,
     )
+
+
+def delay_sigma_s(utc: UtcTie) -> float:
+    """How well the lidar's clock is known to show the UTC of positions from outside [s]."""
+    return float(np.hypot(utc.sigma_ns * 1e-9, LEAST_DELAY_SIGMA_S if utc.source == "gprmc" else BY_BOOT_SIGMA_S))
 
 
 @dataclass(slots=True)

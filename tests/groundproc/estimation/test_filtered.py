@@ -396,6 +396,22 @@ def test_a_better_receiver_gives_its_accuracy(ordinary: list[Flown]) -> None:
     assert estimate.report["legs"][0]["measurements"]["outside position"]["rows"] == 3 * len(better)
 
 
+def test_sigmas_know_that_the_receivers_utc_is_another_clock(ordinary: list[Flown]) -> None:
+    """UTC comes by way of the autopilot, whose gyros may be 10 ms old: some centimetres along the way, where the receiver has one."""
+    flown = ordinary[0]
+    given = flown.given
+    better = outside(flown, given.frame, np.zeros(3), 1.0, 0.01)
+    late = replace(better, time_ns=better.time_ns + 10_000_000)
+    estimate = filtered.filtered_estimate(given, quiet, [late])
+    found = errors(estimate.trajectory, flown.simulated, given.frame)
+    inside = (found.time_s > 1.0) & (found.time_s < SECONDS - 2.0)
+    level = found.position[inside, :2]
+    assert np.sqrt(np.mean(np.square(level))) > 0.015
+    assert (np.abs(level) < 2.0 * found.sigma_position[inside, :2]).mean() > 0.9
+    # across the way and in height nothing is lost: there the receiver's centimetre stands
+    assert np.median(found.sigma_position[inside, 2]) < 0.015
+
+
 def test_sigmas_know_that_errors_of_a_receiver_last(ordinary: list[Flown]) -> None:
     """Errors that last for 10 s are followed, not averaged: with white ones assumed two of three are beyond two sigmas."""
     flown, sigma_m, keep = ordinary[0], 0.03, np.exp(-0.2 / 10.0)
