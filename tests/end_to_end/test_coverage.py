@@ -11,7 +11,6 @@ instruments and fixes, and would be one draw; each flight has a seed of its own.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,59 +18,26 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.stats import chi2
+from statedinstruments import as_stated
 
 from flightlog import frames
-from flightlog.constants import STANDARD_GRAVITY_M_S2
 from flightlog.logfile import LogReader
 from groundproc.accuracy.poses import PoseSeries, common_poses
 from groundproc.accuracy.truth import on_lidar_clock, read_truth
 from groundproc.estimation import methods
-from groundproc.estimation.adjustment.skew import MISALIGNMENT_RAD
-from groundproc.estimation.consensus import POSITION_TAU_S
 from groundproc.estimation.method import gather
-from groundproc.estimation.observations.attitudes import ATTITUDE_SIGMA_RAD, COMPASS_PRIOR
-from groundproc.estimation.observations.inertial import PRIORS
 from groundproc.flight.flight import read_flight
 from groundproc.flight.pairing import legs
 from groundproc.survey import Survey
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory
-from simulator.config import Options
 
 Array = npt.NDArray[np.float64]
 
 BLOCKS = {"position": slice(0, 3), "attitude": slice(3, 6), "both": slice(0, 6)}
 EVERY = 10
 """Poses of which one is looked at: each tenth of a second."""
-STATED_M = (3.0, 4.5)
-"""What fixes of the simulator are stated to be right to, in plan and in height."""
 SOAK = [(("survey_fast_gyro", "meadow", "slope")[seed % 3], seed) for seed in range(101, 113)]
-
-
-def as_stated(options: Options, seed: int) -> Options:
-    """Options with instruments drawn from what the method knows of them before.
-
-    Tilts t_ij of single axes turn a triad by (t_ij - t_ji) / 2: their sigma is the turn's times the square root of two. The turn of the
-    accelerometers against the gyros is known before, and both are turned against the board.
-    """
-    offset, amplitude = np.random.default_rng([seed, 7]).standard_normal(2)
-    gyros_rad, against_rad = MISALIGNMENT_RAD, PRIORS["ins.accel_turn"]
-    tilts_deg = np.rad2deg(np.sqrt(2.0) * np.array([gyros_rad, np.sqrt(against_rad**2 - gyros_rad**2)]))
-    ins = replace(
-        options.ins,
-        gnss_sigma_m=STATED_M[0],
-        height_bias_m=STATED_M[1],
-        gnss_tau_s=float(POSITION_TAU_S[0]),
-        tilt_sigma_deg=float(np.rad2deg(ATTITUDE_SIGMA_RAD[0])),
-        heading_sigma_deg=float(np.rad2deg(ATTITUDE_SIGMA_RAD[2])),
-        compass_offset_deg=float(np.rad2deg(COMPASS_PRIOR[0])) * float(offset),
-        compass_bias_deg=float(np.rad2deg(COMPASS_PRIOR[1])) * abs(float(amplitude)),
-        accel_bias_m_s2=PRIORS["ins.accel_bias"],
-        gyro_misalignment_deg=float(tilts_deg[0]),
-        accel_misalignment_deg=float(tilts_deg[1]),
-    )
-    gyros = replace(options.gyros, accel_bias_g=PRIORS["lidar.accel_bias"] / STANDARD_GRAVITY_M_S2)
-    return replace(options, ins=ins, gyros=gyros)
 
 
 def errors(estimated: PoseSeries, true: PoseSeries) -> Array:

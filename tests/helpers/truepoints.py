@@ -94,3 +94,21 @@ def _beside(points: Points, made: Estimate, truth: Truth, timeline: list[Leg] | 
     echo = echoes[at[same]]
     true_m = np.stack([echo["x"], echo["y"], echo["z"]], axis=1)
     return Compared(points, points.xyz_m - true_m, echo, truth)
+
+
+def shares(found: Compared, chosen: npt.NDArray[np.bool_]) -> dict[int, tuple[float, float]]:
+    """Share of the errors within 1 and 2 sigma: horizontal axes, height."""
+    error, points = np.abs(found.error_m[chosen]), found.points.masked(chosen)
+    within = {}
+    for times in (1, 2):
+        horizontal = error[:, :2] <= times * points["sigma_h"][:, None]
+        within[times] = (float(horizontal.mean()), float((error[:, 2] <= times * points["sigma_v"]).mean()))
+    return within
+
+
+def sizes(found: Compared, chosen: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    """Errors in their sigmas, RMS: horizontal axes, height."""
+    points = found.points.masked(chosen)
+    sigma_m = np.stack([points["sigma_h"], points["sigma_h"], points["sigma_v"]], axis=1)
+    square = np.square(found.error_m[chosen] / sigma_m).mean(axis=0)
+    return float(np.sqrt(square[:2].mean())), float(np.sqrt(square[2]))

@@ -1,8 +1,5 @@
 """Sigmas of points against draws of the errors that they are made of, and against the simulator's truth."""
 
-import json
-import os
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,14 +9,17 @@ import laspy
 import numpy as np
 import numpy.typing as npt
 import pytest
-from truepoints import Compared, compared
+from truepoints import compared, shares, sizes
 
 from flightlog import frames, hdl32e
+from flightlog.constants import HOUR_NS
+from flightlog.logfile import LogReader
 from flightlog.mount import LidarMount, Mount
 from groundproc.accuracy.truth import read_truth
 from groundproc.cli import main
 from groundproc.cloud.pointsigma import LARGEST_M, Errors, MountErrors
-from groundproc.estimation.ownsolution import UERE_M
+from groundproc.flight.flight import read_flight
+from groundproc.flight.pairing import legs
 from groundproc.geodesy import LocalFrame
 from groundproc.numerics.robust import sigma
 from groundproc.sensors.model import Ranging
@@ -196,92 +196,55 @@ def test_a_sigma_beyond_what_a_file_holds_is_the_largest_that_it_does() -> None:
     assert sigma_of(trajectory, np.array([5.0, 10.0, 0.0]), RANGING)[0] == LARGEST_M
 
 
-def shares(found: Compared, chosen: npt.NDArray[np.bool_]) -> dict[int, tuple[float, float]]:
-    """Share of the errors within 1 and 2 sigma: horizontal axes, height."""
-    error, points = np.abs(found.error_m[chosen]), found.points.masked(chosen)
-    within = {}
-    for times in (1, 2):
-        horizontal = error[:, :2] <= times * points["sigma_h"][:, None]
-        within[times] = (float(horizontal.mean()), float((error[:, 2] <= times * points["sigma_v"]).mean()))
-    return within
+def true_estimate(folder: Path) -> Estimate:
+    """The true poses and the true mount, as an estimate. What ties the log's clocks is not the truth: the poses are put on its UTC."""
+    whole = read_truth(folder)
+    with LogReader(whole.log) as reader:
+        flight = read_flight([reader], "ins")
+        lines = legs(flight.runs, flight.boots, whole.mount.mat_ins_lidar(), "auto")[0].lidar_line
+    hours = round((lines[0].reference_ns - whole.lidar.start_ns) / HOUR_NS)
+    utc_ns = whole.trajectory.time_ns + hours * HOUR_NS
+    for line in lines:
+        utc_ns = line(utc_ns)
+    small = np.full((len(utc_ns), 3), 1e-9)
+    exact = replace(
+        whole.trajectory, time_ns=utc_ns, frame=whole.frame, sigma_position_m=small, sigma_attitude_rad=small
+    )
+    return Estimate(exact, whole.mount, "the truth", mount_source="the truth", mount_sigma=None)
 
 
 def test_where_the_poses_are_the_truth_the_errors_are_those_of_the_beam(judged_flight: "Simulated") -> None:
-    """Over ranges and incidences 68 and 95 %. What ties the clocks is not the truth: it leaves a third of a millisecond of turning."""
-    whole = read_truth(judged_flight.folder)
-    poses = whole.trajectory
-    utc = whole.utc.shows_ns(whole.lidar.elapsed_s(poses.time_ns))
-    mats = frames.mat_from_quat(poses.quat_local_ins_wxyz)
-    step_s = np.diff(poses.time_ns)[:, None] * 1e-9
-    turned = mats[:-1].transpose(0, 2, 1) @ mats[1:]
-    rate = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=1) / step_s
-    tie_rad = 0.35e-3 * np.sqrt(np.mean(np.square(rate), axis=0))
-    small, turn = np.full((len(poses), 3), 1e-6), np.tile(tie_rad, (len(poses), 1))
-    exact = replace(poses, time_ns=utc, frame=whole.frame, sigma_position_m=small, sigma_attitude_rad=turn)
-    estimate = Estimate(exact, whole.mount, "the truth", mount_source="the truth", mount_sigma=None)
-    found = compared(judged_flight.folder, estimate, survey=replace(Survey(), boresight_sigma_deg=0.0))
+    """Over ranges and incidences 68 and 95 %, and errors of the size of their sigma."""
+    folder = judged_flight.folder
+    found = compared(folder, true_estimate(folder), survey=replace(Survey(), boresight_sigma_deg=0.0))
     assert len(found.points) > 100_000
-    edges = [0.0, 8.0, 15.0, 30.0, 100.0]
-    slant = found.points["incidence"]
-    for low, high in pairwise(edges):
+    range_m, slant = found.points["range"], found.points["incidence"]
+    # beams nearly level are told in height to less than the millimetre in which a sigma is stored
+    stored = (found.points["sigma_h"] > 0.0) & (found.points["sigma_v"] > 0.0)
+    judged = 0
+    for low, high in pairwise([0.0, 8.0, 15.0, 30.0, 100.0]):
         for begin, end in ((0, 40), (40, 65), (65, 90)):
-            chosen = (found.points["range"] >= low) & (found.points["range"] < high) & (slant >= begin) & (slant < end)
-            if chosen.sum() > 2000:
-                within = shares(found, chosen)
-                # sigma_h is of the mean of two axes: where all of the error is in one, 0.76 and 0.92 of both are within
-                assert 0.66 < within[1][0] < 0.78, (low, begin, within)
-                assert 0.90 < within[2][0] < 0.97, (low, begin, within)
-                # the simulator's ranges are as good on slanted surfaces: too wide beyond 30 m
-                most = (0.76, 0.98) if low < 30.0 or begin < 65 else (0.85, 0.995)
-                assert 0.66 < within[1][1] < most[0], (low, begin, within)
-                assert 0.93 < within[2][1] < most[1], (low, begin, within)
-
-
-def draws(found: Compared) -> Array:
-    """Shares within 1 and 2 sigma over all points of a flight: horizontal and vertical, shape (2, 2)."""
-    everywhere = np.ones(len(found.points), bool)
-    within = shares(found, everywhere)
-    return np.array([within[1], within[2]])
-
-
-def flown(simulated: "Simulated", folder: str) -> Compared:
-    out = simulated.folder / folder
-    words = ["process", str(simulated.log), "--method", "filtered", "--until", "trajectory", "-o", str(out), "--force"]
-    assert main(words) in (0, 3)
-    return compared(simulated.folder, out)
+            chosen = stored & (range_m >= low) & (range_m < high) & (slant >= begin) & (slant < end)
+            if chosen.sum() < 2000:
+                continue
+            judged += 1
+            within, (level, height) = shares(found, chosen), sizes(found, chosen)
+            # sigma_h is of the mean of two axes: where all of the error is in one, 0.76 and 0.92 of both are within
+            assert 0.66 < within[1][0] < 0.78, (low, begin, within)
+            assert 0.90 < within[2][0] < 0.97, (low, begin, within)
+            # the simulator's ranges are as good on slanted surfaces: too wide beyond 30 m
+            least, most = (0.93, (0.76, 0.98)) if low < 30.0 or begin < 65 else (0.75, (0.85, 0.995))
+            assert 0.66 < within[1][1] < most[0], (low, begin, within)
+            assert 0.93 < within[2][1] < most[1], (low, begin, within)
+            assert least < level < 1.06, (low, begin, level)
+            assert least < height < 1.06, (low, begin, height)
+    assert judged >= 8
 
 
 def test_errors_of_one_flight_are_within_two_sigma(judged_flight: "Simulated") -> None:
     """The GNSS is one draw in it, which lasts as long as the flight: so two sigma, not one."""
-    assert draws(flown(judged_flight, "sigma"))[1].min() > 0.95
-
-
-# twenty flights; in the quick suite one
-@pytest.mark.soak
-def test_of_twenty_flights_two_thirds_are_within_one_sigma_and_nineteen_within_two(
-    simulated: Callable[..., "Simulated"],
-) -> None:
-    """The receiver states dilutions of 1.2 and 1.8, which stand for 3.0 and 4.5 m: so far off are its fixes and heights here.
-
-    By default the simulated fixes are better than that, 2.0 and 1.5 m: no fault of what is made of the statement.
-    """
-    from simulator.config import InsOptions, MountOptions, Options
-
-    spread = MountOptions(boresight_spread_deg=Survey().boresight_sigma_deg * np.sqrt(3.0))  # uniform, of that sigma
-    datum = InsOptions(gnss_sigma_m=1.2 * UERE_M, height_bias_m=1.8 * UERE_M)
-    options = replace(Options(), mount=spread, ins=datum)
-    every = [
-        draws(flown(simulated(f"sigma{seed}", "village", 20.0, options, seed=seed, every=10, points=True), "sigma"))
-        for seed in range(100, 120)
-    ]
-    one, two = np.mean(every, axis=0)
-    if path := os.environ.get("SWATH_FIGURES"):
-        with open(path, "a") as file:  # noqa: PTH123
-            file.write(
-                json.dumps({"points_within_1_sigma": one.tolist(), "points_within_2_sigma": two.tolist()}) + "\n"
-            )
-    # 20 flights are 40 draws of a horizontal axis and 20 of the height: 0.68 to 0.07 and 0.10, 0.95 to 0.035 and 0.05, one sigma
-    assert one[0] == pytest.approx(0.68, abs=2 * 0.07)
-    assert one[1] == pytest.approx(0.68, abs=2 * 0.10)
-    assert two[0] > 0.95 - 2 * 0.035
-    assert two[1] > 0.95 - 2 * 0.05
+    out = judged_flight.folder / "sigma"
+    words = ["process", str(judged_flight.log), "--method", "filtered", "--until", "trajectory", "-o", str(out)]
+    assert main([*words, "--force"]) in (0, 3)
+    found = compared(judged_flight.folder, out)
+    assert min(shares(found, np.ones(len(found.points), bool))[2]) > 0.95
