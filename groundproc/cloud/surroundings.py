@@ -26,8 +26,8 @@ _FIRST: Final = (2, 1)
 _LAST: Final = (3, 4)
 """Levels of larger voxels, each of twice the edge of the one before, that are asked for a plane, in this order: before the voxel itself and
 its neighbours are, and after them."""
-MOST: Final = 4_000_000
-"""Voxels of a stretch of flight: some 600 MB."""
+MOST: Final = 2_000_000
+"""Voxels of a stretch of flight: some 440 MB while their planes are found."""
 _PIECE: Final = 1 << 19
 """Room for those of the piece that is one too many; there is more where it takes more."""
 _SOME: Final = 1 << 16

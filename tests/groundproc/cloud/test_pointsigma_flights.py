@@ -83,7 +83,7 @@ def test_errors_of_points_are_those_of_their_sigmas_with_and_without_a_better_re
                 file.write(json.dumps({f"points_within_sigma_{kind}": means.tolist()}) + "\n")
         # 20 flights are at least 20 draws of each
         square = np.square(rows)[:, 4:].mean(axis=0)
-        low, high = chi2.ppf([0.001, 0.999], len(rows)) / len(rows)
+        low, high = (float(chi2.ppf(share, len(rows))) / len(rows) for share in (0.001, 0.999))
         assert (square < high).all(), (kind, square)
         assert (square > low).all(), (kind, square)
         # 0.68 to 0.07 in plan and 0.10 in height, 0.95 to 0.035 and 0.05, one sigma of 40 and 20 draws
