@@ -10,9 +10,9 @@ import pyproj
 import shapely
 
 from flightlog.errors import UsageError
-from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
 from groundproc.cloud import reader
 from groundproc.cloud.metres import Metres
+from groundproc.numerics.lonely import LEAST_SIDE_M, Lonely
 from groundproc.vectors.features import read_features
 
 VOXELS: Final = "voxels"
@@ -70,6 +70,7 @@ def accompanied(cloud: reader.Cloud, metres: Metres, cell_m: float, progress: Ca
     for chunk in reader.chunks(cloud, columns=()):
         found.add(metres.of(chunk.points.xyz_m))
         progress(len(chunk.points))
+    found.widen()
     return found
 
 

@@ -20,12 +20,12 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from flightlog.errors import CoverageError, UsageError
 from groundproc.analysis.sighttask import Task, accompanied, alone, along
-from groundproc.analysis.terrain.lonely import Lonely
 from groundproc.cloud import reader
 from groundproc.cloud.metres import Metres, metres_of, unstated
 from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
+from groundproc.numerics.lonely import Lonely
 from groundproc.numerics.voxelwalk import begin, next_axis
 from groundproc.radiometry import sensorpath
 from groundproc.raster import geotiff

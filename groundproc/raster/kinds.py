@@ -81,6 +81,11 @@ class Kind:
     by_line: bool = False
     cell_m: float = CELL_M
 
+    @property
+    def of_surface(self) -> bool:
+        """It shows a surface, to which no point belongs that is alone."""
+        return self.column == "z" and not self.per_area
+
     def values(self, points: Points) -> Values:
         """The value of each point.
 

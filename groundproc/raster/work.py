@@ -1,22 +1,25 @@
 """From cloud files to a raster file, and from heights to what follows from them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyproj
 
 from flightlog.errors import UsageError
 from groundproc import geodesy
 from groundproc.cloud import reader
+from groundproc.cloud.metres import METRES, Metres, agreed_metres, flat, metres_in
 from groundproc.cloud.sameness import agreed_crs
 from groundproc.cloud.selection import SURFACES, Selection
 from groundproc.files import written_aside
 from groundproc.raster import geotiff, linedifference, tiles
-from groundproc.raster.grid import Window
+from groundproc.raster.grid import Grid, Window
 from groundproc.raster.kinds import Gathered, Kind, derive, gathering, kind, needed
+from groundproc.raster.strays import Accompanied
 
 SUFFIXES: Final = (".tif", ".tiff")
 
@@ -37,7 +40,7 @@ class Task:
     crs : str or None
         EPSG code in place of what the clouds state.
     all_classes : bool
-        Noise and what moves count too.
+        Noise, what moves and points that are alone count too.
     tile_m : float or None
         Side of tiles: `output` is a folder then.
     force : bool
@@ -57,13 +60,25 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """The raster that came of it, and what a person ought to know."""
+    """The raster that came of it, and what a person ought to know.
+
+    Attributes
+    ----------
+    columns, rows : int
+    cell_m : float
+    warnings : tuple of str
+    left_out : int
+        Points of noise and of what moves.
+    alone : int
+        Points that nothing is near, left out of a surface.
+    """
 
     columns: int
     rows: int
     cell_m: float
     warnings: tuple[str, ...]
     left_out: int = 0
+    alone: int = 0
 
 
 def work(task: Task, progress: Callable[[int], object]) -> Made:
@@ -80,38 +95,77 @@ def work(task: Task, progress: Callable[[int], object]) -> Made:
     choices = () if task.all_classes else (SURFACES,)
     clouds = [reader.look(path, *choices) for path in task.inputs]
     crs, warnings = common_crs(clouds, task.crs)
+    unit = METRES if task.crs is not None else agreed_metres(clouds)
     for cloud in clouds:
         missing = [name for name in needed(chosen) if name not in cloud.columns]
         if missing:
             raise UsageError(f"{cloud.path}: has no {missing[0]}, but {', '.join(cloud.columns)}")
     if task.tile_m is not None:
         with tiles.claimed(task.output, task.force) as aside:
-            gathered, left = _gathered(task, chosen, clouds, aside, progress)
-            grid = tiles.write(aside, chosen.name, gathered, crs, task.tile_m)
+            gathered, *left = _gathered(task, chosen, clouds, unit, aside, progress)
+            grid = tiles.write(aside, chosen.name, InUnit(gathered, chosen, unit), crs, task.tile_m / unit.across)
     else:
         with written_aside(task.output) as aside:
-            gathered, left = _gathered(task, chosen, clouds, task.output.parent, progress)
-            gathered.write(aside, crs)
-        with geotiff.opened(task.output) as made:
-            grid = made.grid
-    return Made(grid.columns, grid.rows, grid.cell_m, warnings, left)
+            gathered, *left = _gathered(task, chosen, clouds, unit, task.output.parent, progress)
+            made = InUnit(gathered, chosen, unit)
+            whole, block = made.made(task.output)
+            geotiff.write(aside, whole, crs, made.band, block)
+        with geotiff.opened(task.output) as there:
+            grid = there.grid
+    return Made(grid.columns, grid.rows, grid.cell_m * unit.across, warnings, *left)
+
+
+class InUnit:
+    """A raster that was gathered in metres, with its cells and heights in the unit of the CRS.
+
+    Parameters
+    ----------
+    gathered : Gathered
+    kind : Kind
+    unit : Metres
+    """
+
+    def __init__(self, gathered: Gathered, kind: Kind, unit: Metres) -> None:
+        self._gathered, self._unit = gathered, unit
+        self._heights = not unit.plain and kind.column == "z" and kind.band.unit == "m" and kind.derived is None
+
+    @property
+    def band(self) -> geotiff.Band:
+        """What the raster holds."""
+        return replace(self._gathered.band, unit="") if self._heights else self._gathered.band
+
+    def made(self, path: Path) -> tuple[Grid, Callable[[Window], npt.NDArray[Any]]]:
+        """See `Gathering`."""
+        grid, block = self._gathered.made(path)
+        if self._unit.plain:
+            return grid, block
+        up = np.float32(self._unit.up if self._heights else 1.0)
+        return Grid.of_window(grid, grid.cell_m / self._unit.across), lambda window: block(window) / up
 
 
 def _gathered(
-    task: Task, chosen: Kind, clouds: Sequence[reader.Cloud], folder: Path, progress: Callable[[int], object]
-) -> tuple[Gathered, int]:
-    """All points of the clouds that count, and how many do not."""
+    task: Task,
+    chosen: Kind,
+    clouds: Sequence[reader.Cloud],
+    unit: Metres,
+    folder: Path,
+    progress: Callable[[int], object],
+) -> tuple[Gathered, int, int]:
+    """All points of the clouds that count, in metres; how many do not by their class, and how many are alone."""
     found = gathering(chosen, chosen.cell_m if task.cell_m is None else task.cell_m, folder)
+    near = Accompanied(found.add) if chosen.of_surface and not task.all_classes else None
     left = 0
     for cloud in clouds:
         selection = Selection(cloud.choices)
         for chunk in reader.chunks(cloud, columns=needed(chosen), selection=selection):
-            found.add(chunk.points)
+            points = chunk.points if unit.plain else replace(chunk.points, xyz_m=unit.of(chunk.points.xyz_m))
+            (found if near is None else near).add(points)
             progress(len(chunk.points))
         left += sum(selection.left_out.values())
+    alone = 0 if near is None else near.finish()
     if isinstance(found, linedifference.Gathering):
         found.expect_overlap(task.output)
-    return found, left
+    return found, left, alone
 
 
 def common_crs(clouds: Sequence[reader.Cloud], code: str | None) -> tuple[pyproj.CRS | None, tuple[str, ...]]:
@@ -141,9 +195,14 @@ def _of_heights(task: Task, chosen: Kind) -> Made:
     how = chosen.derived
     with geotiff.opened(task.inputs[0]) as source, written_aside(task.output) as aside:
         grid = source.grid
+        flat(task.inputs[0], source.crs)
+        unit = metres_in(source.crs)
 
-        def block(window: Window) -> np.ndarray:
-            return derive(how, source.window, window, grid.cell_m)
+        def heights(window: Window) -> npt.NDArray[np.float32]:
+            return source.window(window) * np.float32(unit.up)
+
+        def block(window: Window) -> npt.NDArray[Any]:
+            return derive(how, heights, window, grid.cell_m * unit.across)
 
         geotiff.write(aside, grid, source.crs, chosen.band, block)
-        return Made(grid.columns, grid.rows, grid.cell_m, ())
+        return Made(grid.columns, grid.rows, grid.cell_m * unit.across, ())

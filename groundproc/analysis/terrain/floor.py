@@ -13,13 +13,13 @@ import numpy.typing as npt
 from flightlog.errors import CoverageError
 from groundproc.analysis.terrain.filter import bare_ground, smoothed
 from groundproc.analysis.terrain.halls import HALO_M
-from groundproc.analysis.terrain.lonely import LEAST_SIDE_M, Lonely
 from groundproc.analysis.terrain.settings import COARSE_M, FINE_M, PRESETS, settings_for
 from groundproc.analysis.terrain.sparse import SPARSE_M2, bounds_m2, cell_for, density_of
 from groundproc.analysis.terrain.surfaces import Sheet, blocks
 from groundproc.cloud import reader
 from groundproc.cloud.classes import GROUND, HIGH_NOISE, LOW_NOISE, NO_SURFACE, PANE, UNCLASSIFIED
 from groundproc.cloud.metres import metres_of
+from groundproc.numerics.lonely import LEAST_SIDE_M, Lonely
 from groundproc.raster.cells import Cells
 from groundproc.raster.grid import Grid, Window
 

@@ -114,3 +114,10 @@ def test_widths_cells_and_ways_are_in_metres(place: Path, tmp_path: Path) -> Non
     _swath("orthophoto", cloud, "--attribute", "intensity", "--cell", "0.5", "-o", tmp_path / "o.tif")
     with rasterio.open(tmp_path / "o.tif") as raster:
         assert raster.res[0] * FOOT_M == pytest.approx(0.5)
+    for what, unit, least, most in (("dsm", None, 49.0 / FOOT_M, 57.0 / FOOT_M), ("density", "1/m2", 39.9, 40.1)):
+        _swath("raster", cloud, "--what", what, "--cell", "0.5", "-o", tmp_path / f"{what}.tif")
+        with rasterio.open(tmp_path / f"{what}.tif") as raster:
+            assert raster.res[0] * FOOT_M == pytest.approx(0.5)
+            assert raster.units[0] == unit
+            values = raster.read(1, masked=True).compressed()
+        assert least < values.mean() < most
