@@ -1,7 +1,8 @@
 """Hard targets on the ground, under leaves or in the open; and where the light came down at all.
 
 The cloud is read for its ground (see `terrain.floor`), for counts by cell and height, for the points around the places that score, and to
-be written anew if that is asked for. Memory: that of the ground, some 40 bytes for each cell of half a metre, and the points around places.
+be written anew if that is asked for. Memory: that of the ground, some 40 bytes for each cell of half a metre in squares of 128 m that have
+points, and the points around places.
 """
 
 from collections.abc import Callable
@@ -12,13 +13,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
-from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from groundproc.analysis.detection.bodies import AROUND_M, Body, body
 from groundproc.analysis.detection.layers import Layers
 from groundproc.analysis.detection.targets import SIZES_M, scan, top_m
 from groundproc.analysis.terrain.floor import Floor
+from groundproc.analysis.terrain.surfaces import Sheet
 from groundproc.cloud import reader
 from groundproc.cloud.metres import unstated
 from groundproc.cloud.rewriter import Rewriter
@@ -142,14 +143,18 @@ def _counted(task: Task, floor: Floor) -> Layers:
 
 
 def _judge_light(layers: Layers, made: Made) -> None:
-    share = layers.penetration()
-    seen = np.isfinite(share)
-    made.penetration = float(share[seen].mean()) if seen.any() else 0.0
-    made.hectares = float(seen.sum() * CELL_M**2 / 1e4)
-    down = layers.counts.sum(axis=2, dtype=np.float32)
     length, width = SIZES_M[0]
-    few = down < _FEWEST * CELL_M**2 / (length * width)
-    made.blind = float(few[seen].mean()) if seen.any() else 1.0
+    cells, share, few = 0, 0.0, 0
+    for _, _, tile in layers:
+        through = tile.penetration()
+        seen = np.isfinite(through)
+        down = tile.counts.sum(axis=2, dtype=np.float32)[seen]
+        cells += len(down)
+        share += float(through[seen].sum(dtype=np.float64))
+        few += int(np.count_nonzero(down < _FEWEST * CELL_M**2 / (length * width)))
+    made.penetration = share / cells if cells else 0.0
+    made.hectares = float(cells * CELL_M**2 / 1e4)
+    made.blind = few / cells if cells else 1.0
 
 
 def _bodies(task: Task, floor: Floor, layers: Layers) -> list[Body]:
@@ -158,15 +163,17 @@ def _bodies(task: Task, floor: Floor, layers: Layers) -> list[Body]:
     if not places:
         return []
     grid = layers.grid
-    near = np.zeros((grid.rows, grid.columns), np.bool_)
-    near[[each.row for each in places], [each.column for each in places]] = True
-    near = binary_dilation(near, np.ones((3, 3), np.bool_), iterations=int(np.ceil(AROUND_M / CELL_M)))
+    near, reach = Sheet(grid, task.output.parent, np.uint8), int(np.ceil(AROUND_M / CELL_M))
+    for each in places:
+        rows = np.arange(max(each.row - reach, 0), min(each.row + reach + 1, grid.rows))
+        columns = np.arange(max(each.column - reach, 0), min(each.column + reach + 1, grid.columns))
+        near.mark(np.repeat(rows, len(columns)), np.tile(columns, len(rows)), 1)
     parts = []
     for _, xyz, noise in floor.pieces():
         above = _above(floor, xyz)
         row = np.floor((grid.north_m - xyz[:, 1]) / CELL_M).astype(np.int64).clip(0, grid.rows - 1)
         column = np.floor((xyz[:, 0] - grid.west_m) / CELL_M).astype(np.int64).clip(0, grid.columns - 1)
-        keep = near[row, column] & ~noise & (above > -1.0) & (above < layers.high_m)
+        keep = (near.at(row, column) > 0) & ~noise & (above > -1.0) & (above < layers.high_m)
         parts.append(np.column_stack([xyz[keep], above[keep].astype(np.float64)]))
     points = np.concatenate(parts)
     tree = cKDTree(points[:, :2])
@@ -221,18 +228,15 @@ def _write_penetration(path: Path, floor: Floor, layers: Layers) -> None:
     column, row = grid.column // times, grid.row // times
     columns = -(-(grid.column + grid.columns) // times) - column
     rows = -(-(grid.row + grid.rows) // times) - row
-    padded = np.zeros((2, rows * times, columns * times))
-    top, left = (row + rows) * times - grid.row - grid.rows, grid.column - column * times
-    inner = (slice(top, top + grid.rows), slice(left, left + grid.columns))
-    down = layers.counts.sum(axis=2)
-    padded[0][inner], padded[1][inner] = down, np.maximum(layers.pulses, down)
-    down, all_ = padded.reshape(2, rows, times, columns, times).sum(axis=(2, 4))
-    share = np.where(all_ > 0, down / np.maximum(all_, 1.0), np.nan).astype(np.float32)
     shown = Grid(column, row, columns, rows, CELL_M * times / floor.metres.across)
 
     def block(window: Window) -> npt.NDArray[np.float32]:
-        start = row + rows - window.row - window.rows
-        return share[start : start + window.rows, window.column - column : window.column - column + window.columns]
+        top = grid.row + grid.rows - times * (window.row + window.rows)
+        some = layers.window(top, times * window.column - grid.column, times * window.rows, times * window.columns)
+        down = some.counts.sum(axis=2, dtype=np.float64)
+        sums = np.stack([down, np.maximum(some.pulses, down)])
+        down, all_ = sums.reshape(2, window.rows, times, window.columns, times).sum(axis=(2, 4))
+        return np.where(all_ > 0, down / np.maximum(all_, 1.0), np.nan).astype(np.float32)
 
     with written_aside(path) as aside:
         geotiff.write(aside, shown, floor.cloud.crs, geotiff.Band("share of pulses that came down"), block)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from groundproc.analysis.detection.layers import STEP_M, Layers
+from groundproc.analysis.detection.layers import SIDE, STEP_M, Layers
 
 Array = npt.NDArray[np.float64]
 
@@ -25,6 +25,8 @@ SIZES_M: Final = ((4.4, 1.9), (2.2, 1.5), (7.0, 2.6))
 TURNS: Final = 8
 AROUND_M: Final = 24.0
 """Side of the square whose shares are those of the surroundings."""
+_HALO_M: Final = AROUND_M / 2.0 + 6.0
+"""What lies farther from a cell does not matter to its score: half of that square, or the largest rectangle with its rim."""
 _TOP, _BELOW, _OVER, _GROUND = 0.80, 0.12, 0.05, 0.03
 """Shares over a solid body: at its top, at its sides, above it, and beside it on the ground."""
 _MOST: Final = 6.0
@@ -68,18 +70,45 @@ def scan(layers: Layers, least_score: float) -> list[Target]:
     layers : Layers
     least_score : float
     """
-    counts = np.minimum(layers.counts.astype(np.float32), np.float32(200.0))
-    total = counts.sum(axis=2, keepdims=True)
-    counts *= np.minimum(1.0, _MOST / np.maximum(total, 1.0))
-    shares = _surroundings(counts, layers.grid.cell_m)
-    worth = _worth(counts)
+    grid, usual = layers.grid, np.ones(layers.layers + 1)
+    for _, _, tile in layers:
+        usual += _weighted(tile.counts).sum(axis=(0, 1), dtype=np.float64)
+    halo = round(_HALO_M / grid.cell_m)
+    found = [np.empty((0, 6))]
+    for row, column, _ in layers:
+        top, left = max(row - halo, 0), max(column - halo, 0)
+        low, right = min(row + SIDE + halo, grid.rows), min(column + SIDE + halo, grid.columns)
+        counts = _weighted(layers.window(top, left, low - top, right - left).counts)
+        core = slice(row - top, row - top + SIDE), slice(column - left, column - left + SIDE)
+        places = _peaks(*_scored(counts, usual, core, grid.cell_m), core, least_score)
+        places[:, :2] += (top, left)
+        found.append(places)
+    return _apart(np.concatenate(found), grid.cell_m)
+
+
+def _scored(
+    counts: npt.NDArray[np.float32], usual: Array, core: tuple[slice, slice], cell_m: float
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int16]]:
+    """The best score of each cell of a core and the cells next to it, and what it is of: size, turn, top."""
+    shares = _surroundings(counts, usual, cell_m)
+    worth = np.zeros(counts.shape[:2], np.bool_)
+    some = tuple(slice(max(each.start - 1, 0), each.stop + 1) for each in core)
+    worth[some] = _worth(counts)[some]
     best = np.full(counts.shape[:2], -np.inf, np.float32)
     kind = np.zeros((*counts.shape[:2], 3), np.int16)
     for size, sides in enumerate(SIZES_M):
         for turn in range(TURNS):
-            inner, rim = _cells(sides, np.pi * turn / TURNS, layers.grid.cell_m)
+            inner, rim = _cells(sides, np.pi * turn / TURNS, cell_m)
             _score(counts, shares, worth, (inner, rim), best, kind, np.array([size, turn], np.int16))
-    return _peaks(best, kind, layers.grid.cell_m, least_score)
+    return best, kind
+
+
+def _weighted(numbers: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
+    """Counts, no cell with more than so many."""
+    counts = np.minimum(numbers.astype(np.float32), np.float32(200.0))
+    total = counts.sum(axis=2, keepdims=True)
+    counts *= np.minimum(1.0, _MOST / np.maximum(total, 1.0))
+    return counts
 
 
 def _worth(counts: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
@@ -89,12 +118,11 @@ def _worth(counts: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     return np.asarray((up > _FEWEST - 0.5) & (up > _MOSTLY * (ground + up)))
 
 
-def _surroundings(counts: npt.NDArray[np.float32], cell_m: float) -> npt.NDArray[np.float32]:
-    """Shares of layers around each cell, shape (rows, columns, layers + 1)."""
+def _surroundings(counts: npt.NDArray[np.float32], usual: Array, cell_m: float) -> npt.NDArray[np.float32]:
+    """Shares of layers around each cell, shape (rows, columns, layers + 1); `usual` are the counts of all."""
     side = max(round(AROUND_M / cell_m), 3)
     mean = np.stack([uniform_filter(counts[..., k], side, mode="nearest") for k in range(counts.shape[2])], axis=2)
-    overall = counts.sum(axis=(0, 1)) + 1.0
-    prior = overall / overall.sum() * 1e-3
+    prior = usual / usual.sum() * 1e-3
     mean = np.maximum(mean, 0.0) + prior.astype(np.float32)
     return np.asarray(np.maximum(mean / mean.sum(axis=2, keepdims=True), _LEAST_SHARE), np.float32)
 
@@ -114,19 +142,33 @@ def _cells(
     return np.stack([i[inner], j[inner]], axis=1), np.stack([i[rim], j[rim]], axis=1)
 
 
-def _peaks(best: npt.NDArray[np.float32], kind: npt.NDArray[np.int16], cell_m: float, least: float) -> list[Target]:
-    peak = (best >= least) & (best == maximum_filter(best, 3))
+def _peaks(
+    best: npt.NDArray[np.float32], kind: npt.NDArray[np.int16], core: tuple[slice, slice], least: float
+) -> Array:
+    """Cells of a core that score and are the best of their neighbours: row, column, size, turn, top and score, shape (n, 6)."""
+    peak = np.zeros(best.shape, np.bool_)
+    peak[core] = ((best >= least) & (best == maximum_filter(best, 3)))[core]
     rows, columns = np.nonzero(peak)
-    order = np.argsort(-best[rows, columns], kind="stable")
+    return np.column_stack([rows, columns, kind[rows, columns], best[rows, columns]]).astype(np.float64)
+
+
+def _apart(places: Array, cell_m: float) -> list[Target]:
+    """The best of places, and of the others those that lie beyond its reach, and so on."""
+    reaches = [int(np.ceil(0.75 * length / cell_m)) for length, _ in SIZES_M]
+    side = max(reaches)
     found: list[Target] = []
-    taken = np.zeros(best.shape, np.bool_)
-    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
-        if taken[row, column]:
+    near: dict[tuple[int, int], list[Target]] = {}
+    for line in places[np.lexsort((places[:, 1], places[:, 0], -places[:, 5]))].tolist():
+        row, column, size, turn, top = map(int, line[:5])
+        around = [near.get((row // side + i, column // side + j), []) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        if any(
+            max(abs(row - each.row), abs(column - each.column)) <= reaches[each.size]
+            for some in around
+            for each in some
+        ):
             continue
-        size, turn, top = kind[row, column].tolist()
-        found.append(Target(row, column, size, turn, top, float(best[row, column])))
-        reach = int(np.ceil(0.75 * SIZES_M[size][0] / cell_m))
-        taken[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        found.append(Target(row, column, size, turn, top, line[5]))
+        near.setdefault((row // side, column // side), []).append(found[-1])
     return found
 
 
