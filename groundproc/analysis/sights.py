@@ -28,6 +28,7 @@ Array = npt.NDArray[np.float64]
 MODES: Final = (EXACT, FAST, VOXELS)
 SUFFIXES: Final = (".tif", ".tiff")
 _CELL_M: Final = 0.5
+_MOSTLY_UNKNOWN: Final = 0.5
 _GAP_M: Final = 1.0
 """Gaps of a cloud's surface that are bridged, as in hillshades."""
 _MOST_CELLS: Final = 400_000_000
@@ -98,8 +99,22 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
     return {
         "mode": task.mode, "places": len(places), "cells": int(known.size), "visible_cells": int((seen > 0).sum()),
         "unknown_cells": int((~known).sum()), "visible_m2": None if angles else float((seen > 0).sum() * area),
-        "warnings": list(surface.warnings),
+        "warnings": [*surface.warnings, *_gaps(task, surface, known)],
     }  # fmt: skip
+
+
+def _gaps(task: Task, surface: Surface, known: npt.NDArray[np.bool_]) -> list[str]:
+    """What is said of a surface with so many gaps that of most of its cells nothing is known."""
+    heights = np.isfinite(surface.height_m)
+    share = float(np.count_nonzero(heights & ~known)) / max(int(np.count_nonzero(heights)), 1)
+    if share < _MOSTLY_UNKNOWN:
+        return []
+    remedy = "choose a larger --cell"
+    if task.source.suffix.lower() in SUFFIXES:
+        remedy = f"give the cloud itself, in which gaps up to {_GAP_M:g} m are bridged, or a raster of larger cells"
+    return [
+        f"{task.source}: of {share:.0%} of its cells nothing is known, since lines to them cross cells without height; {remedy}"
+    ]
 
 
 def _surface(task: Task, progress: Callable[[int], object]) -> Surface:

@@ -125,6 +125,34 @@ def test_the_command_writes_the_same_grid(tmp_path: Path, capsys: pytest.Capture
     assert main(["viewshed", str(dsm), "--at", "here", "--height", "1", "-o", str(tmp_path / "p.tif")]) == 2
 
 
+def test_a_surface_full_of_gaps_is_said_to_tell_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    z = np.zeros((40, 40), np.float64)
+    for count, told in ((20, False), (400, True)):
+        some = np.random.default_rng(1).choice(z.size, count, replace=False)
+        some = some[some != 20 * 40 + 20]
+        gappy = z.copy()
+        gappy.flat[some] = np.nan
+        source = raster(tmp_path / f"{count}.tif", gappy)
+        with rasterio.open(source) as file:
+            east, north = file.xy(20, 20)
+        assert (
+            main(
+                [
+                    "viewshed",
+                    str(source),
+                    "--at",
+                    f"{east},{north}",
+                    "--height",
+                    "2",
+                    "-o",
+                    str(tmp_path / f"v{count}.tif"),
+                ]
+            )
+            == 0
+        )
+        assert ("give the cloud itself" in capsys.readouterr().err) == told
+
+
 def cloud(path: Path, xyz: Array, **columns: Any) -> Path:
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = [0.001] * 3, [500_000.0, 6_000_000.0, 0.0]
