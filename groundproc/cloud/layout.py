@@ -118,20 +118,34 @@ class Layout:
 def _found(
     clouds: Sequence[Cloud], own: set[str]
 ) -> tuple[set[str], dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """What the headers say: all names, extra bytes but for `own`, least steps, offsets of the first."""
+    """What the headers say: all names, extra bytes but for `own`, least steps, offsets by which they hold all clouds."""
     names: set[str] = set()
     extra: dict[str, Any] = {}
-    scales, offsets = [], []
+    scales, offsets, bounds = [], [], []
     for cloud in clouds:
         with opened(cloud.path) as reader:
             header = reader.header
             names |= set(header.point_format.dimension_names)
             scales.append(header.scales)
             offsets.append(header.offsets)
+            bounds += [header.mins, header.maxs]
             for each in header.point_format.extra_dimensions:
                 if each.name not in own:
                     _one_meaning(extra.setdefault(each.name, each), each, cloud.path)
-    return names, extra, np.min(scales, axis=0), np.asarray(offsets[0])
+    least = np.min(scales, axis=0)
+    return names, extra, least, _holding(np.asarray(offsets[0]), least, np.asarray(bounds))
+
+
+def _holding(
+    offsets: npt.NDArray[np.float64], steps: npt.NDArray[np.float64], bounds: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Offsets of the first cloud; where its coarse steps reach all places of the clouds, shape (n, 3), and the least do not, moved there.
+
+    By whole steps, so that its points stay.
+    """
+    middle = (bounds.min(axis=0) + bounds.max(axis=0)) / 2.0
+    short = ~(np.abs(bounds - offsets).max(axis=0) / steps <= _INT32.max) & np.isfinite(middle)
+    return np.asarray(np.where(short, offsets + np.rint((middle - offsets) / steps) * steps, offsets))
 
 
 def _one_meaning(one: Any, other: Any, path: Path) -> None:
