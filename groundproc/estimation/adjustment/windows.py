@@ -190,12 +190,12 @@ def adjust_window(
     )  # fmt: skip
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart), retiming=retiming_of(observations, motion.source))
+    track.forget(last - OVERLAP if more else last)
     lidar.doubted = along_untold(track)[first:last]
     if motion.source == LIDAR:
         lidar.spin = spin_of(lidar.clusters, path)
         if lidar.spin is not None:
             lidar.spin.read(gyro_readings(observations))
-    track.forget(last - OVERLAP if more else last)
     give_back_memory()
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
