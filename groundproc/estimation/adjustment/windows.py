@@ -199,12 +199,13 @@ def adjust_window(
     give_back_memory()
     batch = Batch(path, lidar, observations, mat.T, free=1.0 if tie is None else TIED, told=told)
     posterior = batch.run()
-    batch.log[-1] |= posterior.figures()
     unknowns, said, seen = batch.unknowns(), batch.said(), None
     if before or more:
         frame = coarse(batch.path)
         kept = {each.name: each.keep(batch.state(), frame) for each in observations}
         patches = patches_of(lidar.clusters, batch.path, len(before))
+    lidar.clusters.put_aside()
+    batch.log[-1] |= posterior.figures()
     lidar.clusters = Clusters.none()  # what is left to do takes the rows alone, and much more
     give_back_memory()
     spread = posterior.spread(DRAWS)

@@ -1,6 +1,9 @@
 """Clusters of many slices, as columns."""
 
-from dataclasses import dataclass
+import tempfile
+import weakref
+from dataclasses import dataclass, field
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -8,7 +11,7 @@ import numpy.typing as npt
 Ints = npt.NDArray[np.int64]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, weakref_slot=True)
 class Clusters:
     """Clusters of all slices: columns of slices.CLUSTER_DTYPE.
 
@@ -27,6 +30,30 @@ class Clusters:
     scatter_m2: npt.NDArray[np.float32]
     count: npt.NDArray[np.int32]
     laser: npt.NDArray[np.int32] | None = None
+    _file: IO[bytes] | None = field(default=None, repr=False, compare=False)
+
+    def put_aside(self) -> None:
+        """Have the scatter, half of all, in a file until it is taken back; where a file has no room, it stays."""
+        if not len(self.scatter_m2):
+            return
+        if self._file is None:
+            file = tempfile.TemporaryFile()  # noqa: SIM115 - it goes with the clusters
+            try:
+                file.write(np.ascontiguousarray(self.scatter_m2).data)
+                file.flush()
+            except OSError:
+                file.close()
+                return
+            self._file = file
+            weakref.finalize(self, file.close)
+        self.scatter_m2 = np.empty((0, 6), np.float32)
+
+    def take_back(self) -> None:
+        """Have the scatter in memory again."""
+        if self._file is not None and not len(self.scatter_m2):
+            self.scatter_m2 = np.empty((len(self), 6), np.float32)
+            self._file.seek(0)
+            self._file.readinto(self.scatter_m2.data)  # type: ignore[attr-defined]  # typing's IO does not know of it, a file does
 
     @classmethod
     def none(cls) -> "Clusters":
