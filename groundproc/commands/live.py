@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     from groundproc.commands.options import add_settings
     from groundproc.commands.outputs import add_force
-    from groundproc.survey import MountSettings, PlacingSettings
+    from groundproc.survey import ClockSettings, MountSettings, PlacingSettings
 
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of what stays")
     add_force(parser)
@@ -43,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--link", choices=("ins", "fc"), help="which autopilot's, with --follow; default: ins")
     add_settings(parser, [MountSettings], only=("mount",))
     parser.add_argument("--height", choices=("msl", "relative"), default="msl", help="of the positions; default: msl")
+    add_settings(parser, [ClockSettings], only=("gyro_delay_ms",))
     add_settings(parser, [PlacingSettings], only=("fov_deg",))
     parser.add_argument("--voxel", type=_metres, default=0.15, metavar="M", help="of the thinned cloud; default: 0.15")
     parser.add_argument("--points", type=int, default=2_000_000, metavar="N",
@@ -152,16 +153,17 @@ def _say_once() -> Callable[[bool], None]:
 
 
 def _options(arguments: argparse.Namespace) -> Any:
+    from flightlog.constants import NS_PER_MS
     from groundproc.commands.options import chosen_settings
     from groundproc.live.estimator import Options
     from groundproc.sensors.shots import Gate
-    from groundproc.survey import PlacingSettings
+    from groundproc.survey import ClockSettings, PlacingSettings
 
     chosen = chosen_settings(arguments, PlacingSettings)
     patience_ns = 400_000_000 if arguments.follow is None else 2_000_000_000
-    return Options(
-        _mount(arguments), arguments.height, Gate(*chosen.fov_deg, chosen.min_range_m, chosen.max_range_m), patience_ns
-    )
+    delay_ns = round(chosen_settings(arguments, ClockSettings).gyro_delay_ms * NS_PER_MS)
+    gate = Gate(*chosen.fov_deg, chosen.min_range_m, chosen.max_range_m)
+    return Options(_mount(arguments), arguments.height, gate, patience_ns, delay_ns)
 
 
 def _mount(arguments: argparse.Namespace) -> Mount:

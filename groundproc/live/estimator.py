@@ -49,6 +49,8 @@ class Options:
     gate: Gate = Gate(255.0, 105.0, 1.0, 100.0)  # noqa: RUF009 - it is frozen
     patience_ns: int = 400_000_000
     """How long to wait for lidar or inertial data that the other is ahead of."""
+    gyro_delay_ns: int = 0
+    """How late the readings of the lidar's own unit are against its returns."""
 
 
 class Estimator:
@@ -87,8 +89,8 @@ class Estimator:
     # What comes -----------------------------------------------------------------------------------------------------
 
     def inertial(self, time_ns: Times, rate_rad_s: Array, force_m_s2: Array) -> None:
-        """Take samples of the lidar's own unit on its clock, shape (n,), (n, 3), (n, 3)."""
-        self._units.take_own(time_ns, rate_rad_s, force_m_s2)
+        """Take samples of the lidar's own unit as stamped on its clock, shape (n,), (n, 3), (n, 3)."""
+        self._units.take_own(time_ns - self.options.gyro_delay_ns, rate_rad_s, force_m_s2)
 
     @property
     def tie(self) -> Tie | None:

@@ -275,6 +275,7 @@ def test_a_lidar_clock_that_is_set_in_flight_begins_anew_in_the_same_frame(
         (["--follow", "none.mcap"], 1, "none.mcap: no such file"),
         (["--mavlink", "udp:nothing"], 2, "--mavlink 'udp:nothing': expected udp:ADDRESS:PORT"),
         (["--points", "5"], 2, "--points 5: expected 10000 or more"),
+        (["--gyro-delay-ms", "80"], 2, "gyro_delay_ms: 80"),
         (["--address", "203.0.113.7"], 1, "UDP port 2368 at 203.0.113.7 cannot be opened"),
     ],
 )

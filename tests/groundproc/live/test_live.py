@@ -20,19 +20,23 @@ import pytest
 from flightlog import records
 from flightlog.errors import LogError, SourceError, UsageError
 from flightlog.logfile import LogReader
+from flightlog.mount import Mount
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS
 from groundproc.estimation.odometry.motion import on_grid
 from groundproc.estimation.odometry.spline import Path as SensorPath
 from groundproc.flight.sync import Sync
 from groundproc.live.clocks import Tie
+from groundproc.live.estimator import Estimator, Options
 from groundproc.live.following import Follower
 from groundproc.live.inbox import Inbox, LogClock, Received, scan_packets
 from groundproc.live.lag import Lag
 from groundproc.live.motion import GrowingMotion, MotionBuilder, Samples
 from groundproc.live.pathline import PathLine
+from groundproc.live.place import Figures
 from groundproc.live.receivers import Port, Receivers, open_mavlink
 from groundproc.live.server import PageServer
 from groundproc.live.slicer import Slicer
+from groundproc.live.telemetry import Telemetry
 from groundproc.live.voxelcloud import VoxelCloud
 from groundproc.sensors.shots import Gate
 
@@ -48,6 +52,24 @@ def free_port(kind: int = socket.SOCK_DGRAM) -> int:
     with socket.socket(socket.AF_INET, kind) as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
+
+
+# Inertial unit --------------------------------------------------------------------------------------------------------
+
+
+def test_a_known_delay_of_the_lidars_unit_is_taken_off_its_stamps() -> None:
+    """What a later flight states of a unit: read 4 ms late, the samples belong 4 ms earlier."""
+    stamps = np.arange(0, 4_000_000_000, 20_000_000, np.int64)
+    rate, force = np.zeros((len(stamps), 3)), np.tile([0.0, 0.0, 9.81], (len(stamps), 1))
+    newest = {}
+    for late_ms in (0, 4):
+        options = Options(Mount(), gyro_delay_ns=late_ms * 1_000_000)
+        estimator = Estimator(options, Telemetry(), Figures(), None)
+        estimator.inertial(stamps, rate, force)
+        gyro = estimator._units.own_gyro()
+        assert gyro is not None
+        newest[late_ms] = gyro.time_ns
+    assert np.array_equal(newest[4], newest[0] - 4_000_000)
 
 
 # Inbox ----------------------------------------------------------------------------------------------------------------
