@@ -37,15 +37,14 @@ class Clusters:
         if not len(self.scatter_m2):
             return
         if self._file is None:
-            file = tempfile.TemporaryFile()  # noqa: SIM115 - it goes with the clusters
             try:
+                file = tempfile.TemporaryFile()  # noqa: SIM115 - it goes with the clusters
+                weakref.finalize(self, file.close)
                 file.write(np.ascontiguousarray(self.scatter_m2).data)
                 file.flush()
             except OSError:
-                file.close()
                 return
             self._file = file
-            weakref.finalize(self, file.close)
         self.scatter_m2 = np.empty((0, 6), np.float32)
 
     def take_back(self) -> None:

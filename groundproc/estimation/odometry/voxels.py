@@ -108,8 +108,9 @@ class PlaneMap:
     def set_aside(self) -> Iterator[None]:
         """Have the voxels, a hundred megabytes, in a file while nobody asks for them; where a file has no room, they stay."""
         count, rows = self.count, len(self.voxels)
-        with tempfile.TemporaryFile() as file:
+        with contextlib.ExitStack() as stack:
             try:
+                file = stack.enter_context(tempfile.TemporaryFile())
                 file.write(self.voxels[:count].data)
                 file.seek(0)
             except OSError:

@@ -1,5 +1,7 @@
 """The map of planes: moments against numpy's, and how it grows and forgets."""
 
+import tempfile
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -158,6 +160,17 @@ def test_a_map_that_was_set_aside_goes_on_as_it_was() -> None:
     assert aside.count == kept.count
     assert len(aside.voxels) == len(kept.voxels)
     np.testing.assert_array_equal(aside.voxels[: aside.count], kept.voxels[: kept.count])
+
+
+def test_a_map_stays_in_memory_where_there_is_no_place_for_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> None:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", nowhere)
+    planes = PlaneMap(0.5)
+    planes.insert(np.zeros((1, 3)), singles(1), 4000.0)
+    with planes.set_aside():
+        assert planes.voxels[0, COUNT] == 1.0
 
 
 def test_the_map_grows_and_forgets_what_is_far_away() -> None:
