@@ -31,7 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tiles", type=float, metavar="M", help="side of tiles [m]: -o is a folder then, with an index (.vrt)"
     )
-    add_all_classes(parser)
+    add_all_classes(
+        parser, "noise and what moves (classes 7, 18 and 69) and, of surfaces, points that are alone count too"
+    )
     parser.add_argument("--crs", metavar="EPSG", help="projected CRS of the clouds; default: as they state")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="the raster, .tif; with --tiles a folder"

@@ -36,11 +36,11 @@ def add_selection(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_all_classes(parser: argparse.ArgumentParser) -> None:
+def add_all_classes(
+    parser: argparse.ArgumentParser, words: str = "noise and what moves (classes 7, 18 and 69) count too"
+) -> None:
     """Declare the one option by which surfaces are made of noise and of what moves too."""
-    parser.add_argument(
-        "--all-classes", action="store_true", help="noise and what moves (classes 7, 18 and 69) count too"
-    )
+    parser.add_argument("--all-classes", action="store_true", help=words)
 
 
 def asked(arguments: argparse.Namespace) -> bool:
