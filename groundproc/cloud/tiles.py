@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groundproc.cloud.spool import Place, Spool
+from groundproc.machine.system import take_disk
 from groundproc.numerics.voxelhash import sorted_by
 
 Array = npt.NDArray[np.float64]
@@ -140,8 +141,10 @@ class Found:
         files = {name: tempfile.TemporaryFile(dir=folder) for name in columns}  # noqa: SIM115 (open as long as this lives)
         for file in files.values():
             weakref.finalize(self, file.close)
+        for name, dtype in columns.items():
+            take_disk(files[name].fileno(), max(points, 1) * np.dtype(dtype).itemsize)
         self._arrays = {
-            name: np.memmap(files[name], np.dtype(dtype), "w+", shape=(max(points, 1),))
+            name: np.memmap(files[name], np.dtype(dtype), "r+", shape=(max(points, 1),))
             for name, dtype in columns.items()
         }
 

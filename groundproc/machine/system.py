@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import errno
 import importlib
 import importlib.util
 import os
@@ -73,6 +74,26 @@ def give_back_disk(file: int, begin: int, size: int) -> None:
         punch = ctypes.CDLL(None).fallocate
         punch.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
         punch(file, _PUNCH_HOLE_KEEP_SIZE, begin, size)
+
+
+def take_disk(file: int, size: int) -> None:
+    """Make an open file so large, with its room on the disk taken now where the system can do so.
+
+    A file with holes that is mapped into memory finds out of a full disk when it is written to: by a signal that kills the process.
+
+    Raises
+    ------
+    OSError
+        There is no room.
+    """
+    take = getattr(os, "posix_fallocate", None)  # not on macOS and Windows
+    if take is not None and size > 0:
+        try:
+            take(file, 0, size)
+        except OSError as error:
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # the file system cannot do it
+                raise
+    os.truncate(file, size)
 
 
 def choose_threads_of_blas() -> None:

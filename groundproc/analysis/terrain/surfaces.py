@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from flightlog.errors import SourceError
+from groundproc.machine.system import take_disk
 from groundproc.numerics.layout import to_read
 from groundproc.raster.grid import Grid, Window
 from groundproc.raster.sampling import around
@@ -29,9 +31,15 @@ class Sheet:
     folder : Path
     dtype : data type
         Cells begin as NaN, or 0 where that is none.
+
+    Raises
+    ------
+    SourceError
+        When it is filled: the disk has no room.
     """
 
     def __init__(self, grid: Grid, folder: Path, dtype: Any = np.float32) -> None:
+        self._folder = folder
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open as long as this lives)
         weakref.finalize(self, self._file.close)
         self.grid, self._dtype = grid, np.dtype(dtype)
@@ -88,8 +96,8 @@ class Sheet:
         """A block to be filled, shape (BLOCK, BLOCK)."""
         if self._slot[key] < 0:
             if self._filled == len(self._blocks):
-                count = min(max(2 * self._filled, 1), self._slot.size)
-                self._file.truncate(count * BLOCK * BLOCK * self._dtype.itemsize)
+                count = min(self._filled + self._filled // 4 + 1, self._slot.size)
+                self._take(count * BLOCK * BLOCK * self._dtype.itemsize)
                 self._blocks = np.memmap(self._file, self._dtype, "r+", shape=(count, BLOCK, BLOCK))
             self._slot[key] = self._filled
             self._filled += 1
@@ -100,6 +108,14 @@ class Sheet:
                 self._blocks[self._slot[key], :rows, :columns] = self._none
         found: npt.NDArray[Any] = self._blocks[self._slot[key]]
         return found
+
+    def _take(self, size: int) -> None:
+        try:
+            take_disk(self._file.fileno(), size)
+        except OSError as error:
+            raise SourceError(
+                f"{self._folder}: no room for temporary files, {size:,} bytes asked for ({error.strerror})"
+            ) from None
 
     def _parts(self, window: Window) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
         """Blocks that a window within the grid reaches into: which, the part of the block, and the part of the window."""

@@ -1,11 +1,14 @@
 """Rasters of which only some blocks are there, against whole ones."""
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_fill_holes
 
+from flightlog.errors import SourceError
 from groundproc.analysis.passage.enclosed import enclosed
 from groundproc.analysis.terrain import surfaces
 from groundproc.analysis.terrain.building import outlines, roof_outlines
@@ -81,3 +84,29 @@ def test_room_goes_by_what_is_filled(tmp_path: Path) -> None:
         sheet.put(Window(n * BLOCK, grid.rows - n * BLOCK - 1, 1, 1), np.ones((1, 1), np.float32))
     assert sheet.window(Window(0, grid.rows - 1, 1, 1))[0, 0] == 1.0
     assert surfaces.BLOCK**2 * 4 * 90 <= sheet._blocks.nbytes <= surfaces.BLOCK**2 * 4 * 128
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "posix_fallocate"), reason="this system takes room on the disk when it is written to"
+)
+def test_a_full_disk_is_one_sentence_and_no_signal_of_the_kernel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mapped into memory, holes of a file would be filled when they are written to, and the process killed."""
+    left = [20 << 20]
+
+    def take(file: int, begin: int, size: int) -> None:
+        if size > left[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fallocate(file, begin, size)
+
+    fallocate = os.posix_fallocate
+    monkeypatch.setattr(os, "posix_fallocate", take)
+    sheet = Sheet(GRID, tmp_path, np.float32)
+    block = next(iter(GRID.blocks(BLOCK)))
+    sheet.put(block, np.ones((block.rows, block.columns), np.float32))
+    left[0] = 6 << 20
+    with pytest.raises(
+        SourceError, match=r"no room for temporary files, \d{1,2},\d{3},\d{3} bytes asked for \(No space left"
+    ):
+        sheet.put(GRID, np.ones((GRID.rows, GRID.columns), np.float32))
