@@ -13,14 +13,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
-from scipy.spatial import cKDTree
 
 from groundproc.analysis.corridor.catenary import Catenary
 from groundproc.analysis.corridor.chains import chained
 from groundproc.analysis.corridor.clearance import Clearance
 from groundproc.analysis.corridor.poles import HALO_M, Pole, upright
 from groundproc.analysis.corridor.spans import attached, conductors
-from groundproc.analysis.corridor.strips import FENCE_HEIGHTS_M, fence, stay
+from groundproc.analysis.corridor.strips import FENCE_HEIGHTS_M, fences, low_strips, stay
 from groundproc.analysis.corridor.thin import RADIUS_M, thin_points
 from groundproc.analysis.corridor.whole import Whole
 from groundproc.analysis.terrain.floor import Floor
@@ -175,32 +174,11 @@ def _found(task: Task, floor: Floor) -> Made:
         lines.append(np.hstack([found.xyz_m, found.direction])[found.core])
         level = np.abs(found.direction[:, 2]) < _LEVEL
         made.poles += upright(tile.xyz_m, above, tile.core, found.xyz_m[level])
-        strips.append(_low_strips(tile.xyz_m, above, tile.core))
+        strips.append(low_strips(tile.xyz_m, above, tile.core))
     points = np.concatenate(lines) if lines else np.empty((0, 6))
     _sort_lines(task, floor, points[:, :3], points[:, 3:], made)
-    low = np.concatenate(strips) if strips else np.empty((0, 7))
-    flat = np.column_stack([low[:, :2], np.zeros(len(low))])
-    for each in chained(flat, low[:, 3:6], 12, 5.0):
-        line = fence(low[each, :3], low[each, 6])
-        if line is not None:
-            made.fences.append(line)
+    made.fences = fences(np.concatenate(strips)) if strips else []
     return made
-
-
-def _low_strips(xyz_m: Array, above_m: npt.NDArray[np.float32], core: npt.NDArray[np.bool_]) -> Array:
-    """Low points on lines in plan with nothing above them: place, direction, height above the ground, shape (n, 7)."""
-    cell = np.floor(xyz_m[:, :2]).astype(np.int64)
-    key = cell[:, 0] * (1 << 32) + cell[:, 1]
-    tall = np.unique(key[(above_m > FENCE_HEIGHTS_M[1] + 0.2) & (above_m < 6.0)])
-    low = (above_m < FENCE_HEIGHTS_M[1]) & ~np.isin(key, tall)
-    flat = np.column_stack([xyz_m[low, :2], np.zeros(int(low.sum()))])
-    found = thin_points(flat, core[low])
-    if not len(found.xyz_m):
-        return np.empty((0, 7))
-    # a line in plan has a direction; the points themselves are taken anew, all of them
-    near = np.asarray(cKDTree(found.xyz_m[:, :2]).query(flat[:, :2], distance_upper_bound=0.2)[1], np.int64)
-    some = (near < len(found.xyz_m)) & core[low]
-    return np.column_stack([xyz_m[low][some], found.direction[near[some]], above_m[low][some].astype(np.float64)])
 
 
 def _sort_lines(task: Task, floor: Floor, xyz_m: Array, direction: Array, made: Made) -> None:

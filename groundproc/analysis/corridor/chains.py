@@ -1,7 +1,7 @@
 """Points of thin lines joined along them."""
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,8 @@ _LEAN: Final = 0.035
 """How far points are off each other's lines: noise, and what the direction errs by, along the way between them."""
 _OVER_M: Final = 0.3
 """Wires so far above the top of a pole go on over it: it is a lamp post."""
+_BLOCK: Final = 2_000
+"""Points whose neighbours are looked at at a time."""
 _TURN: Final = float(np.cos(np.deg2rad(9.0)))
 
 
@@ -39,15 +41,7 @@ def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float, pole
     """
     if len(xyz_m) < fewest:
         return []
-    pairs = cKDTree(xyz_m).query_pairs(_GAP_M, output_type="ndarray")
-    a, b = pairs[:, 0], pairs[:, 1]
-    between = xyz_m[b] - xyz_m[a]
-    joined = np.abs(np.sum(direction[a] * direction[b], axis=1)) > _TURN
-    for each in (a, b):
-        along = np.sum(between * direction[each], axis=1)
-        off = np.sum(between**2, axis=1) - along**2
-        joined &= off < (_OFF_M + _LEAN * np.abs(along)) ** 2
-    a, b = _unsupported(xyz_m, a[joined], b[joined], poles)
+    a, b = _unsupported(xyz_m, *_on_each_other(xyz_m, direction), poles)
     graph = scipy.sparse.coo_array((np.ones(len(a), np.int8), (a, b)), shape=(len(xyz_m),) * 2)
     count, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(number, kind="stable")
@@ -55,6 +49,28 @@ def chained(xyz_m: Array, direction: Array, fewest: int, shortest_m: float, pole
     return [
         each for each in chains if len(each) >= fewest and np.linalg.norm(np.ptp(xyz_m[each], axis=0)) >= shortest_m
     ]
+
+
+def _on_each_other(xyz_m: Array, direction: Array) -> tuple[Ints, Ints]:
+    """Pairs of points that lie near each other on each other's lines."""
+    tree = cKDTree(xyz_m)
+    found = []
+    # block by block: most points have many near them, and few of these on their line
+    for start in range(0, len(xyz_m), _BLOCK):
+        block = cKDTree(xyz_m[start : start + _BLOCK])
+        near: Any = block.sparse_distance_matrix(tree, _GAP_M, output_type="ndarray")
+        a, b = near["i"].astype(np.int64) + start, near["j"].astype(np.int64)
+        once = a < b
+        a, b = a[once], b[once]
+        between = xyz_m[b] - xyz_m[a]
+        joined = np.abs(np.sum(direction[a] * direction[b], axis=1)) > _TURN
+        for each in (a, b):
+            along = np.sum(between * direction[each], axis=1)
+            off = np.sum(between**2, axis=1) - along**2
+            joined &= off < (_OFF_M + _LEAN * np.abs(along)) ** 2
+        found.append(np.column_stack([a[joined], b[joined]]))
+    pairs = np.concatenate(found)
+    return pairs[:, 0], pairs[:, 1]
 
 
 def _unsupported(xyz_m: Array, a: Ints, b: Ints, poles: Sequence[Pole]) -> tuple[Ints, Ints]:

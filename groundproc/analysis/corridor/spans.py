@@ -1,7 +1,7 @@
 """Conductors from attachment to attachment, of chains of points."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -48,10 +48,19 @@ _NEXT_M: Final = 0.5
 SAME_M: Final = 0.1
 """Curves nearer to each other are one."""
 _WORST_M: Final = 0.12
+_UNBROKEN_M: Final = 10.0
 _JOIN_M: Final = 40.0
 """Gap that a conductor may have."""
 _COVERED: Final = 0.5
 _BIN_M: Final = 5.0
+
+
+class _Joint(NamedTuple):
+    """A piece that continues another: the gap between them, its number, and the curve of both."""
+
+    gap_m: float
+    number: int
+    both: Catenary
 
 
 class _Meeting(NamedTuple):
@@ -96,7 +105,7 @@ def cut(points_m: Array, depth: int = 0) -> list[Array]:
     place, best = _kink(points_m, s)
     if place and best * _BETTER < _misfit(points_m):
         return cut(points_m[:place], depth + 1) + cut(points_m[place:], depth + 1)
-    on = _one_of(points_m)
+    on = _unbroken(s, _one_of(points_m))
     if _LEAST_PIECE <= on.sum() < len(points_m):
         return cut(points_m[on], depth + 1) + cut(points_m[~on], depth + 1)
     return [points_m]
@@ -117,6 +126,17 @@ def _kink(points_m: Array, s: Array) -> tuple[int, float]:
         if step < _KINK_M:
             return place, best
         low, high = max(where - step, s[0] + _LEAST_PIECE_M), min(where + step, s[-1] - _LEAST_PIECE_M)
+
+
+def _unbroken(s: Array, on: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Of some points in order the most that have no gap: a wide curve may touch the lowest points of two spans."""
+    some = np.flatnonzero(on)
+    if not len(some):
+        return on
+    runs = np.split(some, np.flatnonzero(np.diff(s[some]) > _UNBROKEN_M) + 1)
+    chosen = np.zeros_like(on)
+    chosen[max(runs, key=len)] = True
+    return chosen
 
 
 def _one_of(points_m: Array) -> npt.NDArray[np.bool_]:
@@ -187,29 +207,29 @@ def joined(pieces: Sequence[Array]) -> list[Array]:
     out = []
     while left:
         points, curve = left.pop(0), curves.pop(0)
-        n = 0
-        while n < len(left):
-            both = _together(points, curve, left[n], curves[n])
-            if both is None:
-                n += 1
-                continue
-            points = np.concatenate([points, left.pop(n)])
-            curves.pop(n)
-            curve, n = both, 0
+        # the nearest first: with one of the next span, beyond a piece of its own, a wire may seem to be one wide curve
+        while found := min(_continuing(points, curve, left, curves), key=lambda each: each.gap_m, default=None):
+            points, curve = np.concatenate([points, left.pop(found.number)]), found.both
+            curves.pop(found.number)
         out.append(points)
     return out
 
 
-def _together(points: Array, curve: Catenary, others: Array, other: Catenary) -> Catenary | None:
-    """The one curve of two pieces, if they are of one."""
-    s, off, up = curve.local(others)
-    gap = max(s.min() - curve.end_m, curve.start_m - s.max())
-    if gap > _JOIN_M or gap < -1.0 - 0.1 * other.length_m:
-        return None
-    if np.median(np.abs(off)) > 0.4 + 0.01 * gap or np.median(np.abs(up)) > 0.6 + 0.04 * max(gap, 0.0):
-        return None
-    both = fitted(np.concatenate([points, others]))
-    return both if both.rms_m < 1.3 * max(curve.rms_m, other.rms_m, 0.032) else None
+def _continuing(points: Array, curve: Catenary, left: list[Array], curves: list[Catenary]) -> Iterator[_Joint]:
+    """The pieces that are of one curve with another."""
+    for number, (others, other) in enumerate(zip(left, curves, strict=True)):
+        s, off, up = curve.local(others)
+        gap = max(s.min() - curve.end_m, curve.start_m - s.max())
+        if gap > _JOIN_M:
+            continue
+        if np.median(np.abs(off)) > 0.4 + 0.01 * gap or np.median(np.abs(up)) > 0.6 + 0.04 * max(gap, 0.0):
+            continue
+        both = fitted(np.concatenate([points, others]))
+        beside = gap < -1.0 - 0.1 * other.length_m
+        if beside and max(np.median(_apart(both, each)) for each in (points, others)) > SAME_M:
+            continue
+        if both.rms_m < 1.3 * max(curve.rms_m, other.rms_m, 0.032):
+            yield _Joint(gap, number, both)
 
 
 def settled(pieces: Sequence[Array]) -> list[Array]:

@@ -22,6 +22,16 @@ _BESIDE_M: Final = 0.35
 """... and nearer ones than that beside it. See `thin`."""
 _PRICE: Final = 1.5
 """Points on a wire that one beside it outweighs."""
+_STRIPE_M: Final = 0.2
+_CROWDED: Final = 0.6
+_CROWDED_FLAT: Final = 0.75
+"""Share of the points so near to a wire that are nearer than half of that, at least: with 7 cm of noise it is 0.65, about a stripe of a
+surface 0.5, about its edge up to 0.7. The latter holds where the points' cross-section is flat ..."""
+_FLAT: Final = 0.75
+"""Share of the points so near to a wire that are nearer than half of that, at least: with 7 cm of noise it is 0.65, about a stripe of a surface
+0.5, about its edge up to 0.7. The latter holds where the points' cross-section is flat ..."""
+_FLAT: Final = 3.0
+"""... so many times as wide as it is thin."""
 _TIP_M: Final = 5.0
 """How much of an end may be what it is fastened to."""
 _FEWEST: Final = 10
@@ -74,7 +84,7 @@ class Whole:
                 del found[number]
                 rows[rows[:, 0] == number, 0] = onto
                 found[onto] = self._fit(rows, onto)
-        return [found[number] for number in numbers if number in found]
+        return [found[number] for number in numbers if number in found and _hangs_free(rows, number, found[number])]
 
     def _fit(self, rows: Array, number: int) -> Catenary:
         """One wire by its rows."""
@@ -93,6 +103,18 @@ class Whole:
         first = np.flatnonzero(np.append(True, (np.diff(metre, axis=0) != 0).any(axis=1)))
         rank = np.arange(len(rows)) - np.repeat(first, np.diff(np.append(first, len(rows))))
         self._kept, self._fresh = [rows[rank < _KEPT]], 0
+
+
+def _hangs_free(rows: Array, number: int, wire: Catenary) -> bool:
+    """Whether points crowd about a wire as noise has it, and do not lie side by side like those of a roof, a wall or their edges."""
+    s, off, up = wire.local(rows[rows[:, 0] == number, 2:])
+    near = np.hypot(off, up)
+    mine = (near < _STRIPE_M) & (s > wire.start_m) & (s < wire.end_m)
+    if mine.sum() < _FEWEST:
+        return True
+    thin, wide = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(off[mine], up[mine])), 0.0))
+    least = _CROWDED if wide < _FLAT * thin else _CROWDED_FLAT
+    return bool(np.mean(near[mine] < 0.5 * _STRIPE_M) >= least)
 
 
 def _same(wire: Catenary, other: Catenary) -> bool:
