@@ -24,14 +24,12 @@ _PRICE: Final = 1.5
 """Points on a wire that one beside it outweighs."""
 _STRIPE_M: Final = 0.2
 _CROWDED: Final = 0.6
-_CROWDED_FLAT: Final = 0.75
 """Share of the points so near to a wire that are nearer than half of that, at least: with 7 cm of noise it is 0.65, about a stripe of a
-surface 0.5, about its edge up to 0.7. The latter holds where the points' cross-section is flat ..."""
-_FLAT: Final = 0.75
-"""Share of the points so near to a wire that are nearer than half of that, at least: with 7 cm of noise it is 0.65, about a stripe of a surface
-0.5, about its edge up to 0.7. The latter holds where the points' cross-section is flat ..."""
+surface 0.5 ..."""
+_CROWDED_FLAT: Final = 0.75
+"""... and where the points' cross-section is flat, as about the edge of a surface, where it is up to 0.7."""
 _FLAT: Final = 3.0
-"""... so many times as wide as it is thin."""
+"""A cross-section is flat that is so many times as wide as it is thin."""
 _TIP_M: Final = 5.0
 """How much of an end may be what it is fastened to."""
 _FEWEST: Final = 10
