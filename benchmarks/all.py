@@ -19,8 +19,8 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "benchmarks.md"
 FIGURES: Final = ROOT / "docs" / "benchmarks.json"
 NO_BENCHMARKS: Final = (
-    "all", "drawing", "imagery_painting", "long_log", "machine", "mutations", "uses_banks", "uses_change", "uses_closeups",
-    "uses_clouds", "uses_ground", "uses_peers", "uses_places", "uses_radiometry", "uses_sight",
+    "all", "drawing", "imagery_painting", "large_products", "long_log", "machine", "mutations", "uses_banks", "uses_change",
+    "uses_closeups", "uses_clouds", "uses_ground", "uses_peers", "uses_places", "uses_radiometry", "uses_sight",
 )  # fmt: skip
 """This one, what others use, and what measures the tests."""
 ON_DEMAND: Final = ("kit", "study", "windows")

@@ -2,11 +2,11 @@
 
     benchmarks/large_products.py CLOUD -o DIR [--copies 10] [WORK ...]
 
-The cloud of a flight is laid out again and again, side by side, with all its attributes: each copy is a flight line of its
-own, later than the one before. Half of the copies lie in one file, half in another, and `merge` joins them for what comes after
-it. Each command is a process of its own; for each, a line of JSON says `million` points, `cpu_s` with its children's, `peak_mb`
-(the highest resident memory of the process and of its children together, looked at each fifth of a second), and `read_by`, what
-an outside reader found in it. Files stay in DIR, so that a WORK may be done alone.
+The cloud of a flight is laid out again and again, side by side, with all its attributes: each copy is a flight line of its own, later
+than the one before. They do not overlap: strips have nothing to differ in. Half of the copies lie in one file, half in another, and
+`merge` joins them for what comes after it. Each command is a process of its own; for each, a line of JSON says `million` points, `cpu_s`
+with its children's, `peak_mb` (the highest resident memory of the process and of its children together, looked at each fifth of a
+second), and `read_by`, what an outside reader found in it. Files stay in DIR, so that a WORK may be done alone.
 """
 
 import argparse
@@ -34,7 +34,6 @@ RASTERS: Final[dict[str, list[str]]] = {
     "local-relief": ["local-relief"],
     "sky-view": ["sky-view"],
     "sigma": ["sigma"],
-    "strip-difference": ["strip-difference"],
 }
 SWATH: Final = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
 
@@ -54,13 +53,14 @@ def main() -> int:
         for part, which in zip(parts, (range(half), range(half, asked.copies)), strict=True):
             lay_out(asked.cloud, part, which)
     points = sum(count_las(part) for part in parts)
-    todo = works(asked.output)
+    todo, failed = works(asked.output), False
     for name in asked.works or todo:
         words, read = todo[name]
         told = measured([*words, "--force"])
-        line = {"work": name, "million": round(points / 1e6, 1), **told, "read_by": read()}
+        failed |= told["code"] != 0
+        line = {"work": name, "million": round(points / 1e6, 1), **told, "read_by": None if told["code"] else read()}
         print(json.dumps(line), flush=True)
-    return 0
+    return int(failed)
 
 
 def works(folder: Path) -> dict[str, tuple[list[str], Callable[[], Any]]]:
