@@ -12,7 +12,7 @@ from numba import config
 
 def at_once(work: Callable[[int], object], count: int) -> None:
     """Do `work` of 0 to `count` - 1, each once, by as many threads as kernels may take: the first here, and all where that is one."""
-    threads = min(config.NUMBA_NUM_THREADS, count)  # type: ignore[attr-defined] # numba sets it when it is imported
+    threads = max(min(config.NUMBA_NUM_THREADS, count), 1)  # type: ignore[attr-defined] # numba sets it when it is imported
     errors: list[BaseException] = []
 
     def do(first: int) -> None:

@@ -29,3 +29,8 @@ def test_an_error_in_a_part_comes_when_all_threads_have_ended(monkeypatch: pytes
     with pytest.raises(ValueError, match="second part"):
         at_once(work, 8)
     assert not [each for each in threading.enumerate() if each.name == "at once"]
+
+
+def test_of_no_work_nothing_comes() -> None:
+    """Over water there may not be a single row."""
+    at_once(lambda part: pytest.fail(f"part {part} was asked for"), 0)
