@@ -38,8 +38,8 @@ from groundproc.trajectory.covariance import SIZE
 
 Array = npt.NDArray[np.float64]
 
-WINDOW: Final = 2400
-"""Slices of a window, four minutes: most flights of a multirotor are one to three windows, and one takes about 1 GB."""
+WINDOW: Final = 2100
+"""Slices of a window, three and a half minutes: most flights of a multirotor are one to three windows, and one takes about 1 GB."""
 OVERLAP: Final = 200
 LEVER_FLOOR_M: Final = 0.003
 """What the residuals do not show of the lever arm: it is found through accelerometers, whose axes are no better than a gyro's (`skew`)."""
