@@ -1,9 +1,10 @@
 """Clusters of many slices, as columns."""
 
+import contextlib
+import io
 import tempfile
 import weakref
 from dataclasses import dataclass, field
-from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ class Clusters:
     scatter_m2: npt.NDArray[np.float32]
     count: npt.NDArray[np.int32]
     laser: npt.NDArray[np.int32] | None = None
-    _file: IO[bytes] | None = field(default=None, repr=False, compare=False)
+    _file: io.BufferedRandom | None = field(default=None, repr=False, compare=False)
 
     def put_aside(self) -> None:
         """Have the scatter, half of all, in a file until it is taken back; where a file has no room, it stays."""
@@ -38,10 +39,11 @@ class Clusters:
             return
         if self._file is None:
             try:
-                file = tempfile.TemporaryFile()  # noqa: SIM115 - it goes with the clusters
-                weakref.finalize(self, file.close)
-                file.write(np.ascontiguousarray(self.scatter_m2).data)
-                file.flush()
+                with contextlib.ExitStack() as stack:
+                    file = stack.enter_context(tempfile.TemporaryFile())
+                    file.write(np.ascontiguousarray(self.scatter_m2).data)
+                    file.flush()
+                    weakref.finalize(self, stack.pop_all().close)  # it goes with the clusters
             except OSError:
                 return
             self._file = file
@@ -52,7 +54,7 @@ class Clusters:
         if self._file is not None and not len(self.scatter_m2):
             self.scatter_m2 = np.empty((len(self), 6), np.float32)
             self._file.seek(0)
-            self._file.readinto(self.scatter_m2.data)  # type: ignore[attr-defined]  # typing's IO does not know of it, a file does
+            self._file.readinto(self.scatter_m2.data)
 
     @classmethod
     def none(cls) -> "Clusters":
