@@ -92,11 +92,14 @@ class Found:
         Points that are echoes of two surfaces.
     stretches : list of cleaning.Stretch
         One for each stretch of flight that was cleaned.
+    points : int
+        How many there are, where that is known before the first of them is handed on: the flight is one stretch. Else 0.
     """
 
     classes: dict[int, int] = field(default_factory=dict)
     mixed: int = 0
     stretches: list[cleaning.Stretch] = field(default_factory=list)
+    points: int = 0
 
     def add(self, points: Points) -> None:
         """Count points."""
@@ -143,10 +146,12 @@ def described(stream: Stream, scene: Scene, names: frozenset[str], found: Found 
         yield from (_with_attributes(points, scene, names, None) for points in stream())
         return
     ahead, along, behind = (stream() for _ in range(3))
-    while True:
-        around, pieces = _gathered(ahead, scene)
+    for stretch in itertools.count():
+        around, pieces, count = _gathered(ahead, scene)
         if not pieces:
             return
+        if not stretch and not around.full:
+            found.points = count
         around.find_planes()
         classes: cleaning.Classes | None = None
         if "classes" in names:
@@ -181,17 +186,17 @@ def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> fre
     return lookout.evidence.open_looks
 
 
-def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, int]:
-    """The surroundings of the next stretch of flight, and the number of its pieces."""
-    around, pieces = Surroundings(), 0
+def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, int, int]:
+    """The surroundings of the next stretch of flight, and the numbers of its pieces and of its points."""
+    around, pieces, count = Surroundings(), 0, 0
     for points in ahead:
-        pieces += 1
+        pieces, count = pieces + 1, count + len(points)
         if len(points):
             beams = Beams.of(points.time_ns, scene.trajectory, scene.mount)
             around.add(points.xyz_m, points.time_ns, beams.origins(points.time_ns))
         if around.full:
             break
-    return around, pieces
+    return around, pieces, count
 
 
 def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known: _Known | None) -> Points:

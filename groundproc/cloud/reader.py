@@ -22,6 +22,7 @@ from groundproc.cloud.dimensions import TABLE, Dimension, in_order
 from groundproc.cloud.gpstime import Clock, is_week_time
 from groundproc.cloud.points import Points
 from groundproc.cloud.selection import Choice, Selection
+from groundproc.cloud.setaside import SetAside
 from groundproc.machine import system
 
 CHUNK: Final = 1_000_000
@@ -126,7 +127,7 @@ def look(path: Path, *choices: Choice) -> Cloud:
 
 def chunks(
     cloud: Cloud, clock: Clock | None = None, columns: Collection[str] | None = None, selection: Selection | None = None,
-    picked: Picked | None = None, parts: laz.Parts | None = None,
+    picked: Picked | None = None, parts: laz.Parts | None = None, aside: SetAside | None = None,
 ) -> Iterator[Chunk]:  # fmt: skip
     """All points of a file that are wanted; no piece is empty where some are not.
 
@@ -143,6 +144,8 @@ def chunks(
         Given the number of a piece's first point and how many it has: a mask of those that are wanted at all. Only they are unfolded.
     parts : sequence of (int, int), optional
         First point and number of points, at most `CHUNK`, of each part of the file that is read at all, in this order.
+    aside : SetAside, optional
+        What was kept as the file was written: parts that it has are taken from there.
 
     Raises
     ------
@@ -156,7 +159,7 @@ def chunks(
     needed = {*asked, *(name for each in selection.choices for name in each.columns)}
     with opened(cloud.path, parts) as reader:
         seen = 0
-        for record in _records(cloud.path, reader, parts):
+        for record in _records(cloud.path, reader, parts, aside):
             begin, seen = seen, seen + len(record)
             if picked is not None:
                 record = _of(record, picked(begin, len(record)))
@@ -269,8 +272,8 @@ def _column(entry: Dimension, record: Any) -> npt.NDArray[Any]:
     return np.asarray(values, entry.column)
 
 
-def _records(path: Path, reader: Any, parts: laz.Parts | None = None) -> Iterator[Any]:
-    points = reader.chunk_iterator(_at_once(reader.header)) if parts is None else _of_parts(reader, parts)
+def _records(path: Path, reader: Any, parts: laz.Parts | None = None, aside: SetAside | None = None) -> Iterator[Any]:
+    points = reader.chunk_iterator(_at_once(reader.header)) if parts is None else _of_parts(reader, parts, aside)
     while True:
         try:
             record = next(points)
@@ -281,7 +284,13 @@ def _records(path: Path, reader: Any, parts: laz.Parts | None = None) -> Iterato
         yield record
 
 
-def _of_parts(reader: Any, parts: laz.Parts) -> Iterator[Any]:
+def _of_parts(reader: Any, parts: laz.Parts, aside: SetAside | None) -> Iterator[Any]:
+    if aside is not None and aside.has(parts):
+        header = reader.header
+        for part in parts:
+            records = aside.read(part, header.point_format.dtype())
+            yield laspy.ScaleAwarePointRecord(records, header.point_format, header.scales, header.offsets)
+        return
     for first, count in parts:
         reader.seek(first)
         yield reader.read_points(count)

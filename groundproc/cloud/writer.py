@@ -14,6 +14,7 @@ import pyproj
 
 from groundproc.cloud.packer import Packer
 from groundproc.cloud.points import Points
+from groundproc.cloud.setaside import SetAside
 from groundproc.cloud.storing import begun, ended, storing
 from groundproc.machine.system import cores
 
@@ -41,6 +42,8 @@ class CloudWriter:
         Times are UTC, and are written as adjusted standard GPS time; False: they are the sensor's own, written as seconds.
     about : str
         At most 31 characters for the header's system identifier.
+    aside : SetAside, optional
+        Keeps what it wants of the records.
 
     Raises
     ------
@@ -57,8 +60,9 @@ class CloudWriter:
         offset_m: Sequence[float] = (0.0, 0.0, 0.0),
         gps: bool = True,
         about: str = "Velodyne HDL-32E",
+        aside: SetAside | None = None,
     ) -> None:
-        self._path = path
+        self._path, self._aside = path, aside
         self._packer = Packer(path, columns, crs=crs, offset_m=offset_m, gps=gps, about=about)
         self._las = begun(path, self._packer.header)
         self._filling, self._used = np.zeros(BUFFER_POINTS, self._packer.dtype), 0
@@ -120,6 +124,8 @@ class CloudWriter:
                     with storing(self._path):
                         record = laspy.PackedPointRecord(points, self._las.header.point_format)
                         self._las.point_writer.write_points(record)
+                    if self._aside is not None:
+                        self._aside.see(points)
             except BaseException as error:  # handed to the producer, whatever it is
                 self._error = error
             self._free.put(points)  # also after an error, so that the producer never waits for a dead thread

@@ -45,6 +45,18 @@ def assign(world_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.int32], int]:
         _enter(keys[:found], table)
 
 
+def newcomers(xyz_m: Array, corner_m: Array, voxel_m: float) -> tuple[npt.NDArray[np.bool_], int]:
+    """Which points, shape (n, 3), are the first in their voxel, counted from a corner; and how many voxels there are."""
+    first = np.zeros(len(xyz_m), np.bool_)
+    table, at, found = np.full(2 * _FIRST_VOXELS, -1, np.int64), 0, 0
+    while True:
+        at, found = _newcomers(xyz_m, corner_m, 1.0 / voxel_m, (at, found), table, first)
+        if at == len(xyz_m):
+            return first, int(found)
+        table, known = np.full(2 * len(table), -1, np.int64), table
+        _enter_keys(known, table)
+
+
 def table_for(slots: int) -> npt.NDArray[np.int32]:
     """An empty table with room for so many voxels and more."""
     return np.full(1 << int(np.ceil(np.log2(max(slots, 1 << 10)))), -1, np.int32)
@@ -79,6 +91,41 @@ def _enter(keys: npt.NDArray[np.int64], table: npt.NDArray[np.int32]) -> None:
         while table[slot] >= 0:
             slot = (slot + 1) & mask
         table[slot] = number
+
+
+@njit(cache=True, nogil=True)
+def _newcomers(
+    xyz: Any, corner: Any, per_m: float, begin: tuple[int, int], table: npt.NDArray[np.int64], out: npt.NDArray[np.bool_]
+) -> Any:  # fmt: skip
+    """Mark the first points of voxels from one on, so many voxels being known: the point where the table is full, and the voxels then.
+
+    The table holds keys, not numbers: one place in memory for each point, not two.
+    """
+    mask, (first, found) = len(table) - 1, begin
+    x, y, z = corner[0], corner[1], corner[2]
+    for n in range(first, len(xyz)):
+        key = voxel_key(xyz[n, 0] - x, xyz[n, 1] - y, xyz[n, 2] - z, per_m)
+        slot = spread(key) & mask
+        while table[slot] >= 0 and table[slot] != key:
+            slot = (slot + 1) & mask
+        if table[slot] < 0:
+            if 2 * found >= len(table):
+                return n, found
+            table[slot], out[n] = key, True
+            found += 1
+    return len(xyz), found
+
+
+@njit(cache=True, nogil=True)
+def _enter_keys(keys: npt.NDArray[np.int64], table: npt.NDArray[np.int64]) -> None:
+    """Put the keys of a table into an empty one."""
+    mask = len(table) - 1
+    for n in range(len(keys)):
+        if keys[n] >= 0:
+            slot = spread(keys[n]) & mask
+            while table[slot] >= 0:
+                slot = (slot + 1) & mask
+            table[slot] = keys[n]
 
 
 @njit(cache=True, nogil=True)

@@ -17,7 +17,9 @@ class CloudLaz:
         """Write points."""
         if self._writer is None:
             context = self._context
-            writer = CloudWriter(self._path, points.columns, crs=context.crs, offset_m=context.origin_m)
+            writer = CloudWriter(
+                self._path, points.columns, crs=context.crs, offset_m=context.origin_m, aside=context.set_aside
+            )
             self._writer = context.kept.enter_context(writer)
         self._writer.write(points)
 

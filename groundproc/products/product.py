@@ -12,6 +12,7 @@ from flightlog import __version__
 from flightlog.errors import SourceError, SwathError
 from groundproc.cloud.packer import round_origin_m
 from groundproc.cloud.points import Points
+from groundproc.cloud.setaside import SetAside
 from groundproc.files import written_aside
 from groundproc.geodesy import Projection, with_sea_level
 from groundproc.products import Chosen
@@ -50,6 +51,8 @@ class Context:
         Rasters made in the same pass.
     foreseen : Foreseen, optional
         What the report will ask of the cloud, read while others were finished.
+    set_aside : SetAside, optional
+        Keeps points of cloud.laz for the report as they are written.
     kept : contextlib.ExitStack
         Of this product alone: what is entered here is left when the product is finished, or has failed.
     """
@@ -65,6 +68,7 @@ class Context:
     software: str = f"swath {__version__}"
     layers: Layers = field(default_factory=Layers)
     foreseen: "Foreseen | None" = None
+    set_aside: SetAside | None = None
     kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from groundproc.cloud import reader
 from groundproc.cloud.georeference import extent
+from groundproc.cloud.setaside import SetAside
 from groundproc.reporting.markup import Html, tag
 from groundproc.viewer.packing import pack
 from groundproc.viewer.page import held
@@ -65,8 +66,8 @@ class Foreseen:
     mark: tuple[int, int, int]
 
 
-def foreseen(path: Path, most: int) -> Foreseen:
-    """Some points of a cloud that will be asked for.
+def foreseen(path: Path, most: int, aside: SetAside | None = None) -> Foreseen:
+    """Some points of a cloud that will be asked for, of those that were set aside where these are the ones.
 
     Raises
     ------
@@ -74,7 +75,7 @@ def foreseen(path: Path, most: int) -> Foreseen:
         The cloud is damaged.
     """
     mark = _mark(path)
-    return Foreseen(_of(path, most), most, mark)
+    return Foreseen(_of(path, most, aside), most, mark)
 
 
 def read(folder: Path, most: int, before: Foreseen | None = None) -> CloudPart | None:
@@ -93,9 +94,9 @@ def read(folder: Path, most: int, before: Foreseen | None = None) -> CloudPart |
     return _of(path, most)
 
 
-def _of(path: Path, most: int) -> CloudPart:
+def _of(path: Path, most: int, aside: SetAside | None = None) -> CloudPart:
     cloud = reader.look(path)
-    points = thin(cloud, most, in_time=True)
+    points = thin(cloud, most, in_time=True, aside=aside)
     return CloudPart(points, shades_of(points.columns, _since(points)), cloud.points, cloud.crs)
 
 

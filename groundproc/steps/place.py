@@ -17,6 +17,7 @@ from groundproc import geodesy
 from groundproc.cloud import attributes, placing
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import MountErrors
+from groundproc.cloud.setaside import Parts, SetAside
 from groundproc.flight.lidar import lidar_of
 from groundproc.flight.shots import Tally, shots
 from groundproc.flight.timeline import tied
@@ -37,6 +38,7 @@ from groundproc.strips.options import StripOptions
 from groundproc.survey import AttributeSettings, PlacingSettings, Survey, TrimSettings, section
 from groundproc.trajectory.estimate import Estimate
 from groundproc.vectors.features import read_features
+from groundproc.viewer.thinning import stretches
 
 FOUND: Final = f"{INSIDE}/place.json"
 """What quality.json says of shots and points."""
@@ -119,15 +121,22 @@ def work(run: Run, folders: Folders) -> None:
     found, selection = attributes.Found(), selection_of(survey, made.trajectory, projection.crs)
     lines = line_begins_ns(made.trajectory, StripOptions().turn_deg)
     scene = attributes.Scene(made.trajectory, made.mount, mount_errors(made, survey), lidar.ranging, lines)
+    shown = shown_of_laz(run, folders)
+
+    def wanted() -> Parts:
+        return [] if selection.choices else stretches(found.points, shown)  # how many a choice leaves is not known yet
+
+    aside = SetAside(wanted) if shown else None
     with contextlib.ExitStack() as stack:
         sinks: list[placing.Sink] = []
         for each in longest_first(chosen(survey.products)):
             if each.name in folders:
-                own = replace(context, folder=folders[each.name])
+                own = replace(context, folder=folders[each.name], set_aside=aside if each.name == CLOUD else None)
                 sinks += stack.enter_context(streamed([each], own))
         try:
             described = attributes.described(stream, scene, names, found)
-            sinks = foreseeing(run, folders, sinks)
+            if shown:
+                sinks = foreseeing(run, folders, sinks, shown, aside)
             placed = placing.handed_on(described, made.trajectory, projection, sinks, selection)
         except CoverageError:
             if tally.packets:
@@ -139,20 +148,28 @@ def work(run: Run, folders: Folders) -> None:
         _tell(folders[WHOLE] / FOUND, lidar, projection, tally, placed, found)
 
 
-def foreseeing(run: Run, folders: Folders, sinks: list[placing.Sink]) -> list[placing.Sink]:
-    """The sinks; of a cloud.laz, what a report will show of it is read as soon as it is closed, beside the finishing of the others.
+def shown_of_laz(run: Run, folders: Folders) -> int:
+    """How many points of the cloud.laz that is being made its report will show, if they can be found beside the finishing of the others.
 
-    Not where the report shows the octree, or where photographs or uses come before it, which may change the cloud and need the memory.
+    0 where the report shows the octree, where photographs or uses come before it, which may change the cloud and need the memory, and on
+    one core.
     """
     survey = run.survey
     asked = {each.name: each for each in chosen(survey.products)}
     late = survey.images is not None or survey.uses
     if REPORT not in asked or OCTREE in asked or CLOUD not in folders or late or not run.whole or cores() == 1:
-        return sinks
+        return 0
     (options,) = asked[REPORT].options
+    return int(options.points)
+
+
+def foreseeing(
+    run: Run, folders: Folders, sinks: list[placing.Sink], shown: int, aside: SetAside | None
+) -> list[placing.Sink]:
+    """The sinks; what the report will show of cloud.laz is found as soon as that is closed, beside the finishing of the others."""
 
     def read() -> None:
-        run.foreseen = foreseen(folders[CLOUD] / CLOUD, options.points)
+        run.foreseen = foreseen(folders[CLOUD] / CLOUD, shown, aside)
 
     return [placing.Then(sinks[0], read), *sinks[1:]]
 

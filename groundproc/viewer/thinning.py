@@ -12,8 +12,9 @@ from groundproc.cloud import reader
 from groundproc.cloud.georeference import extent
 from groundproc.cloud.nodes import NodeReader, is_copc, octree_of
 from groundproc.cloud.reader import Cloud
+from groundproc.cloud.setaside import Parts, SetAside
 from groundproc.machine.readahead import ahead
-from groundproc.numerics.voxelhash import assign
+from groundproc.numerics.voxelhash import newcomers
 
 Array = npt.NDArray[np.float64]
 
@@ -63,7 +64,13 @@ class Thinned:
         return Thinned(self.xyz_m[chosen], columns, None if self.time_s is None else self.time_s[chosen], spacing_m)
 
 
-def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None, in_time: bool = False) -> Thinned:
+def thin(
+    cloud: Cloud,
+    most: int,
+    columns: Collection[str] | None = None,
+    in_time: bool = False,
+    aside: SetAside | None = None,
+) -> Thinned:
     """At most so many points, spread as evenly as voxels of one size can; the same ones every time.
 
     Parameters
@@ -75,6 +82,8 @@ def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None, in_tim
     in_time : bool
         The points are known to be those of one flight in the order of time. Then stretches of it are read whole, and others not at all:
         a sensor that turns sees each place for seconds, of which stretches of 0.3 s are a fair sample, and unpacking costs the most.
+    aside : SetAside, optional
+        Where it kept `stretches` as the file was written, nothing is unpacked.
 
     Raises
     ------
@@ -86,8 +95,11 @@ def thin(cloud: Cloud, most: int, columns: Collection[str] | None = None, in_tim
     held: dict[str, npt.NDArray[Any]] = {}
     used = 0
     # filled piece by piece: pieces and their sum together would be twice the memory
-    source = _of_octree if octree else _of_flight if in_time else _of_file
-    with contextlib.closing(ahead(source(cloud, room, columns))) as parts:
+    if in_time and not octree:
+        source = _of_flight(cloud, stretches(cloud.points, most), columns, aside)
+    else:
+        source = (_of_octree if octree else _of_file)(cloud, room, columns)
+    with contextlib.closing(ahead(source)) as parts:
         for part in parts:
             arrays = {"": part.xyz_m, **part.columns} | ({} if part.time_s is None else {_TIME: part.time_s})
             count = min(len(part), room + _MORE - used)
@@ -107,18 +119,16 @@ def thinner(points: Thinned, most: int) -> Thinned:
         return points
     corner, far = extent(points.xyz_m)
     low, high = 0.0, float((far - corner).max()) + 0.001
-    local = points.xyz_m - corner
     voxel_m = max(high / np.sqrt(most), points.spacing_m)
     best: tuple[npt.NDArray[Any], float] | None = None
     last, power = None, _SURFACE
     for _ in range(_TRIALS):
-        voxel, found = assign(local, voxel_m)
+        first, found = newcomers(points.xyz_m, corner, voxel_m)
         if found > most:
             low = voxel_m
         else:
             high = voxel_m
-            # voxels are numbered as they are met: the first point of each
-            best = np.flatnonzero(np.diff(np.maximum.accumulate(voxel), prepend=-1) > 0), voxel_m
+            best = np.flatnonzero(first), voxel_m
             if found >= _CLOSE * most:
                 break
         if last is not None and found != last[1]:
@@ -164,13 +174,19 @@ def _of_file(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterat
         yield _whole(cloud, chunk)
 
 
-def _of_flight(cloud: Cloud, most: int, columns: Collection[str] | None) -> Iterator[Thinned]:
-    """Stretches of a flight, as many as make up so many points, evenly over its time."""
-    begins = range(0, cloud.points, _STRETCH)
-    count = min(max(most // _STRETCH, 1), len(begins))
+def stretches(points: int, most: int) -> Parts:
+    """Of a flight of so many points, what is looked at for at most so many of them: stretches evenly over its time."""
+    begins = range(0, points, _STRETCH)
+    count = min(max(min(_READ[1] * most, points) // _STRETCH, 1), len(begins))
     chosen = [begins[i * len(begins) // count] for i in range(count)]
-    parts = [(begin, min(_STRETCH, cloud.points - begin)) for begin in chosen]
-    for chunk in reader.chunks(cloud, columns=columns, parts=parts):
+    return [(begin, min(_STRETCH, points - begin)) for begin in chosen]
+
+
+def _of_flight(
+    cloud: Cloud, parts: Parts, columns: Collection[str] | None, aside: SetAside | None
+) -> Iterator[Thinned]:
+    """Stretches of a flight."""
+    for chunk in reader.chunks(cloud, columns=columns, parts=parts, aside=aside):
         yield _whole(cloud, chunk)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from groundproc.numerics.voxelhash import assign, row_by_row
+from groundproc.numerics.voxelhash import assign, newcomers, row_by_row
 
 
 def test_rows_of_cells_from_the_corner() -> None:
@@ -39,3 +39,14 @@ def test_voxels_are_numbered_as_they_first_come(points: int, across_m: float) ->
     rank[np.argsort(begins)] = np.arange(len(begins))
     assert voxels == len(begins)
     assert (voxel == rank[of_point.ravel()]).all()
+
+
+@pytest.mark.parametrize(("points", "across_m"), [(0, 1.0), (1, 1.0), (5_000, 2.0), (300_000, 40.0)])
+def test_the_first_point_of_each_voxel(points: int, across_m: float) -> None:
+    """However many voxels there are: the last case has more than the table begins with room for."""
+    corner = np.array([500_000.0, 6_000_000.0, -3.0])
+    xyz = corner + np.random.default_rng(6).uniform(0.0, 2 * across_m, (points, 3))
+    first, voxels = newcomers(xyz, corner, 0.5)
+    begins = np.unique(np.floor((xyz - corner) * 2.0).astype(int), axis=0, return_index=True)[1]
+    assert voxels == len(begins)
+    assert np.flatnonzero(first).tolist() == sorted(begins)

@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 
 from groundproc.cli import main
+from groundproc.cloud import laz, lazworker
+from groundproc.cloud.setaside import SetAside
 from groundproc.reporting import cloudpart
 from groundproc.steps import OF_IMAGES, place
 from groundproc.steps import ORDER as ALL
@@ -109,13 +111,18 @@ def test_force_does_everything_and_gives_the_same_points(log: Path, out: Path, m
 def test_what_the_report_shows_of_a_cloud_is_read_once_where_it_is_made_in_one_go(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reads, read = list[str](), cloudpart._of
+    reads, read, unpacked, start = list[str](), cloudpart._of, list[str](), laz.start
 
-    def counted(path: Path, most: int) -> cloudpart.CloudPart:
+    def counted(path: Path, most: int, aside: SetAside | None = None) -> cloudpart.CloudPart:
         reads.append(path.parent.parent.name)
-        return read(path, most)
+        return read(path, most, aside)
+
+    def started(task: lazworker.Task) -> Any:
+        unpacked.append(task.path)
+        return start(task)
 
     monkeypatch.setattr(cloudpart, "_of", counted)
+    monkeypatch.setattr(laz, "start", started)
     monkeypatch.setattr(place, "cores", lambda: 2)
     folder = tmp_path / "out"
     words = ("process", str(log), "--method", "ins", "--products", "cloud.laz,report.html", "-o", str(folder))
@@ -123,10 +130,13 @@ def test_what_the_report_shows_of_a_cloud_is_read_once_where_it_is_made_in_one_g
     assert reads == [], "nothing asks for it yet"
     assert main(list(words)) in COMPLETE
     assert reads == [tmp_path.name], "from the finished folder"
+    assert unpacked
+    unpacked.clear()
     once = (folder / "report.html").read_text()
     assert main([*words, "--force"]) in COMPLETE
     assert len(reads) == 2
     assert reads[1] != tmp_path.name, "from where it is made"
+    assert not unpacked, "its points were set aside as they were written"
     data = [re.findall(r'id="cloud-data">[^<]*', page) for page in (once, (folder / "report.html").read_text())]
     assert data[0] == data[1]
     assert data[0]
