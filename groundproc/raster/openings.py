@@ -1,16 +1,20 @@
 """Grey-scale openings of rasters by octagons: what is narrower than twice the radius is levelled down to its surroundings.
 
-An octagon, close to a disc, is a square widened by a diamond, and decomposes into lines: a minimum along a line costs three comparisons a
-cell whatever its length (van Herk 1992).
+An octagon, close to a disc, is a square widened by a diamond, and decomposes into lines. The least value along a line is found by doubling:
+of two cells, of two such pairs, and so on. All steps of an octagon follow each other row by row, so that the rows in hand stay in the
+processor's cache, and a step takes several cells at once.
 """
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 Raster = npt.NDArray[np.float32]
+
+_CROSS: Final = 2
+"""Rows that a step reaches which widens by a cell's four neighbours."""
 
 
 def opened(surface: Raster, radius: int) -> Raster:
@@ -46,99 +50,89 @@ def _parts(radius: int) -> tuple[int, int]:
 
 
 def _octagon(surface: Raster, square: int, diamond: int, highest: bool) -> Raster:
-    # lines may lead out of the raster and back into it
-    margin = square + diamond
-    rows, columns = surface.shape
-    values = np.full((rows + 2 * margin, columns + 2 * margin), np.inf, np.float32)
-    inner = (slice(margin, margin + rows), slice(margin, margin + columns))
-    values[inner] = -surface if highest else surface
-    if square:
-        values = _along_rows(values, square)
-        values = np.ascontiguousarray(_along_rows(np.ascontiguousarray(values.T), square).T)
     # two diagonal lines make a diamond with holes like a chess board; a small cross closes them, and adds one to its half side
     half = max(diamond - 1, 0) // 2
-    if half:
-        values = _along_diagonals(_along_diagonals(values, half, 1), half, -1)
-    for _ in range(diamond - 2 * half):
-        values = _cross(values)
-    found = values[inner]
-    return -found if highest else np.ascontiguousarray(found)
+    across = np.array(_doublings(2 * square + 1), np.int64)
+    down = [(step, 0, step) for step in _doublings(2 * square + 1)]
+    down += [(step, turn * step, step) for turn in (1, -1) for step in _doublings(2 * half + 1)]
+    down += [(1, 0, _CROSS)] * (diamond - 2 * half)
+    sign = np.float32(-1.0 if highest else 1.0)
+    steps = np.array(down, np.int64).reshape(-1, 3)
+    return np.asarray(_widened(surface, sign, square + diamond, 2 * half, across, steps))
+
+
+def _doublings(length: int) -> list[int]:
+    """Steps after which a cell has the least value of so many from itself on."""
+    steps, covered = [], 1
+    while covered < length:
+        steps.append(min(covered, length - covered))
+        covered += steps[-1]
+    return steps
 
 
 @njit(cache=True, nogil=True)
-def _along_rows(values: Any, half: int) -> Any:
-    """Least value within `half` cells to the left and right."""
-    rows, columns = values.shape
-    length = 2 * half + 1
+def _widened(surface: Any, sign: Any, margin: int, left: int, across: Any, down: Any) -> Any:
+    """Least values of a surface times a sign, after steps to the right, then steps of rows and columns and the rows that they reach.
+
+    Steps lead to the right, downwards, and down to the left. So the least value around a cell stands `margin` rows above it in the end, and
+    `margin` - `left` columns before it. A row has taken a step before the rows above it take the next.
+    """
+    rows, columns = surface.shape
+    # lines may lead out of the raster and back into it
+    wide, high = columns + 2 * margin, rows + 2 * margin
+    values = np.full((high, wide), np.float32(np.inf))
     out = np.empty((rows, columns), np.float32)
-    padded = columns + 2 * half
-    pieces = (padded + length - 1) // length
-    size = pieces * length
-    line, back = np.empty(size, np.float32), np.empty(size, np.float32)
-    for i in range(rows):
-        line[:half] = np.inf
-        line[half : half + columns] = values[i]
-        line[half + columns :] = np.inf
-        _van_herk(line, back, length, out[i], columns)
+    line, spare = np.empty(wide, np.float32), np.empty(wide, np.float32)
+    for newest in range(high + 2 * margin):
+        if margin <= newest < margin + rows:
+            line[:] = np.inf
+            _load(surface[newest - margin], sign, line[margin : margin + columns])
+            for step in across:
+                # to and fro: a row that is read where it is written is done a cell at a time
+                _lesser(line[: wide - step], line[step:], spare)
+                spare[wide - step :] = line[wide - step :]
+                line, spare = spare, line
+            values[newest] = line
+        row = newest
+        for n in range(len(down)):
+            row -= down[n, 2]
+            if 0 <= row < high - down[n, 2]:
+                _step(values, row, down[n, 0], down[n, 1], down[n, 2])
+        if 0 <= row < rows:
+            _load(values[row, left : left + columns], sign, out[row])
     return out
 
 
 @njit(cache=True, nogil=True)
-def _van_herk(line: Any, back: Any, length: int, out: Any, count: int) -> None:
-    """Least of each `length` values that follow each other: by least values from the ends of pieces."""
-    size = len(line)
-    for start in range(0, size, length):
-        end = start + length - 1
-        back[end] = line[end]
-        for k in range(end - 1, start - 1, -1):
-            back[k] = min(line[k], back[k + 1])
-        for k in range(start + 1, end + 1):
-            line[k] = min(line[k], line[k - 1])
-    for k in range(count):
-        out[k] = min(back[k], line[k + length - 1])
+def _step(values: Any, row: int, down: int, right: int, reach: int) -> None:
+    """One step of a row."""
+    ours, other = values[row], values[row + down]
+    if reach > down:
+        _cross(ours, other, values[row + _CROSS])
+    elif right < 0:
+        _lesser(ours[-right:], other[:right], ours[-right:])
+    else:
+        _lesser(ours[: len(ours) - right], other[right:], ours)
 
 
 @njit(cache=True, nogil=True)
-def _along_diagonals(values: Any, half: int, turn: int) -> Any:
-    """Least value within `half` steps along a diagonal, down to the right (1) or to the left (-1)."""
-    rows, columns = values.shape
-    if half == 0:
-        return values.copy()
-    length = 2 * half + 1
-    out = np.empty((rows, columns), np.float32)
-    longest = min(rows, columns) + 2 * half
-    size = (longest + length - 1) // length * length
-    line, back, found = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    for start in range(-(rows - 1), columns):
-        i0, j0 = max(0, -start), max(0, start)
-        count = min(rows - i0, columns - j0)
-        used = (count + 2 * half + length - 1) // length * length
-        line[:used] = np.inf
-        for k in range(count):
-            j = j0 + k
-            line[half + k] = values[i0 + k, j if turn > 0 else columns - 1 - j]
-        _van_herk(line[:used], back[:used], length, found, count)
-        for k in range(count):
-            j = j0 + k
-            out[i0 + k, j if turn > 0 else columns - 1 - j] = found[k]
-    return out
+def _load(source: Any, sign: Any, out: Any) -> None:
+    for j in range(len(out)):
+        out[j] = sign * source[j]
 
 
 @njit(cache=True, nogil=True)
-def _cross(values: Any) -> Any:
-    """Least value of a cell and its four neighbours."""
-    rows, columns = values.shape
-    out = np.empty((rows, columns), np.float32)
-    for i in range(rows):
-        for j in range(columns):
-            low = values[i, j]
-            if i > 0:
-                low = min(low, values[i - 1, j])
-            if i < rows - 1:
-                low = min(low, values[i + 1, j])
-            if j > 0:
-                low = min(low, values[i, j - 1])
-            if j < columns - 1:
-                low = min(low, values[i, j + 1])
-            out[i, j] = low
-    return out
+def _lesser(one: Any, other: Any, out: Any) -> None:
+    for j in range(len(one)):
+        out[j] = one[j] if one[j] < other[j] else other[j]
+
+
+@njit(cache=True, nogil=True)
+def _cross(top: Any, middle: Any, low: Any) -> None:
+    """Least value of a cell and its four neighbours, kept where the row above begins."""
+    for j in range(len(top) - 2):
+        a = top[j + 1] if top[j + 1] < low[j + 1] else low[j + 1]
+        b = middle[j] if middle[j] < middle[j + 2] else middle[j + 2]
+        a = a if a < b else b
+        top[j] = a if a < middle[j + 1] else middle[j + 1]
+    top[len(top) - 2 :] = np.float32(np.inf)
