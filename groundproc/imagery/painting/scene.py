@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from flightlog.errors import CaptureError
+from flightlog.errors import CaptureError, SourceError
 from groundproc.cloud import reader
 from groundproc.cloud.selection import CLASS, standing
 from groundproc.cloud.spool import Spool
 from groundproc.imagery.painting.planes import Known, columns, surfaces
 from groundproc.imagery.painting.visibility import Surface
 from groundproc.imagery.site import Site
-from groundproc.machine.system import cores
+from groundproc.machine.system import cores, take_disk
 from groundproc.numerics.voxelhash import sorted_by
 
 Array = npt.NDArray[np.float64]
@@ -224,8 +224,23 @@ def side_by_side(work: Callable[[T], U], items: Iterable[T]) -> Iterator[U]:
 
 
 def mapped(path: Path, dtype: npt.DTypeLike, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """An array of zeros in a file of its own."""
-    found = np.lib.format.open_memmap(path.with_suffix(".npy"), mode="w+", dtype=np.dtype(dtype), shape=shape)
+    """An array of zeros in a file of its own.
+
+    Raises
+    ------
+    SourceError
+        The disk has no room for it.
+    """
+    path = path.with_suffix(".npy")
+    found = np.lib.format.open_memmap(path, mode="w+", dtype=np.dtype(dtype), shape=shape)
+    with path.open("r+b") as file:
+        size = path.stat().st_size
+        try:
+            take_disk(file.fileno(), size)
+        except OSError as error:
+            raise SourceError(
+                f"{path.parent}: no room for temporary files, {size:,} bytes asked for ({error.strerror})"
+            ) from None
     return np.asarray(found)  # compiled code wants plain arrays
 
 

@@ -1,5 +1,7 @@
 """A cloud in squares and tiles: every point once, and none of a picture lost with a tile."""
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +9,10 @@ import numpy.typing as npt
 import pytest
 import rendered
 
+from flightlog.errors import SourceError
 from groundproc.cloud import reader
 from groundproc.imagery.painting.block import half_angle_rad, load
-from groundproc.imagery.painting.scene import Scene, localised, side_by_side, towards
+from groundproc.imagery.painting.scene import Scene, localised, mapped, side_by_side, towards
 from groundproc.imagery.painting.visibility import project
 from groundproc.imagery.site import cartesian
 
@@ -81,3 +84,19 @@ def test_work_side_by_side_keeps_the_order_and_hands_errors_on() -> None:
     assert [int(found[0]) for found in side_by_side(work, range(5))] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="seven"):
         list(side_by_side(work, range(20)))
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "posix_fallocate"), reason="this system takes room on the disk when it is written to"
+)
+def test_a_full_disk_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is mapped has its room before it is written to: a hole that finds none would be a signal that kills the process."""
+    found = mapped(tmp_path / "here", np.float32, (1000, 100))
+    assert (tmp_path / "here.npy").stat().st_blocks * 512 >= found.nbytes
+
+    def full(file: int, begin: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(SourceError, match=r"no room for temporary files, 40,\d{3} bytes asked for \(No space left"):
+        mapped(tmp_path / "there", np.float32, (100, 100))
