@@ -1,22 +1,20 @@
 """`swath`: finds its commands by entry points, runs one, and turns errors of the outside world into one sentence."""
 
 import argparse
-import contextlib
 import os
 import re
 import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from types import FrameType
 from typing import Final, NoReturn
+
+from groundproc.machine.stopping import Stopped, stoppable
 
 GROUP: Final = "swath.commands"
 OURS: Final = ("flightlog", "groundproc", "onboard", "simulator")
 _INTERRUPTED: Final = 128 + signal.SIGINT
-_TERMINATED: Final = 128 + signal.SIGTERM
 _BROKEN_PIPE: Final = 128 + 13  # SIGPIPE, which is not on every system
 _LONGEST: Final = 4000
 """Characters of a sentence on the terminal."""
@@ -51,20 +49,18 @@ class Parser(argparse.ArgumentParser):
         return f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: a command cleans up after it as after Ctrl-C."""
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `swath` and give its exit code: 0, 1 for what went wrong outside, 2 for a wrong command line."""
     words = list(sys.argv[1:] if argv is None else argv)
     _make_legible()
     try:
-        with _terminable():
+        with stoppable():
             code = _dispatch(words)
             sys.stdout.flush()
-    except Terminated:
-        return _TERMINATED
+    except Stopped as stop:
+        if stop.number not in (signal.SIGINT, signal.SIGTERM):  # whoever sent those knows
+            _say("the processor's time that this process may take (ulimit -t) is used up; nothing half-written is left")
+        return 128 + stop.number
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
@@ -90,23 +86,6 @@ def _say(sentence: str) -> None:
     from flightlog.words import clean
 
     print(f"swath: {clean(sentence, _LONGEST)}", file=sys.stderr)
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM as an exception, so that what is half-written is removed."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _outside(error: Exception) -> tuple[str, int]:

@@ -16,6 +16,7 @@ from flightlog.errors import SourceError
 from groundproc.cloud.octree import MOST, CrowdError, Cube, Key, Octree
 from groundproc.cloud.spool import Records
 from groundproc.machine.readahead import ahead
+from groundproc.machine.stopping import heard
 from groundproc.machine.system import cores
 
 Bytes = npt.NDArray[np.uint8]
@@ -61,7 +62,7 @@ class CopcBuilder:
             It cannot be written, or the points of one place are too many for a node.
         """
         try:
-            with path.open("wb+") as file:
+            with heard(), path.open("wb+") as file:
                 self._write(file)
         except OSError as error:
             raise SourceError(f"{path}: cannot be written ({error.strerror or error})") from None

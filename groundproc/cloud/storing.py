@@ -10,6 +10,7 @@ import laspy
 import lazrs
 
 from flightlog.errors import SourceError
+from groundproc.machine.stopping import heard
 
 _NEXT_TO_NOTHING: Final = 1 << 20
 """lazrs keeps to itself why a write failed: with less space than this left [bytes], that was why."""
@@ -19,7 +20,8 @@ _NEXT_TO_NOTHING: Final = 1 << 20
 def storing(path: Path) -> Iterator[None]:
     """Turn what goes wrong on the disk into a SourceError that names the file."""
     try:
-        yield
+        with heard():
+            yield
     except OSError as error:
         raise SourceError(f"{path}: cannot be written ({error.strerror or error})") from None
     except lazrs.LazrsError as error:
