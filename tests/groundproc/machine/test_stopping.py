@@ -26,7 +26,8 @@ class Writing(io.BytesIO):
         self._happens = happens
 
     def write(self, data: Any) -> int:
-        self._happens()
+        happens, self._happens = self._happens, lambda: None
+        happens()
         return super().write(data)
 
 
