@@ -6,6 +6,7 @@ followed; then each point is processed again, in the same order. A stretch ends 
 linear and the memory bounded.
 """
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from groundproc.cloud.beams import Beams
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import Errors, MountErrors
 from groundproc.cloud.surroundings import Surroundings
+from groundproc.machine import readahead
 from groundproc.machine.system import give_back_memory
 from groundproc.sensors.model import Ranging
 from groundproc.trajectory.trajectory import Trajectory
@@ -177,12 +179,19 @@ class _Known:
 def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Looks:
     """What the beams of a stretch passed through, as `freespace.Evidence` has it."""
     lookout = freespace.Lookout(around)
-    for points in pieces:
-        if len(points):
-            origins = Beams.of(points.time_ns, scene.trajectory, scene.mount).origins(points.time_ns)
-            voxel = around.of(points.xyz_m)
-            slant = around.incidence_deg(points.xyz_m, origins, voxel)
-            lookout.look_along(points.xyz_m, origins, points.time_ns, slant, voxel)
+
+    def rays() -> Iterator[tuple[Any, ...]]:
+        for points in pieces:
+            if len(points):
+                origins = Beams.of(points.time_ns, scene.trajectory, scene.mount).origins(points.time_ns)
+                voxel = around.of(points.xyz_m)
+                slant = around.incidence_deg(points.xyz_m, origins, voxel)
+                yield points.xyz_m, origins, points.time_ns, slant, voxel
+
+    with contextlib.closing(readahead.ahead(rays())) as made:
+        for some in made:
+            lookout.look_along(*some)
+            del some  # the next piece takes their memory
     return lookout.evidence.open_looks
 
 

@@ -10,7 +10,8 @@ most beams alone. So a beam counts against a voxel only
 
 Beams of one revolution are one look. The rays are taken from the sensor to the echo, through cubes of 2 m, and where something lies in one
 through its voxels: the cost is linear in the length of the beams. Each cube has 512 bits that say which of its voxels hold points, so that
-an empty one costs no look-up. Threads share the cubes between them: each goes along all rays, and into its own cubes only.
+an empty one costs no look-up. Threads share the cubes between them: each goes along all rays, and into its own cubes only. One core is left
+to make the next piece of rays: going along them once is cheaper than twice.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -123,7 +124,7 @@ class Lookout:
 
     def __init__(self, around: Surroundings) -> None:
         self._around, self.evidence = around, Evidence.none(around.used)
-        self._threads = min(cores(), _MOST_THREADS)
+        self._threads = max(min(cores() - 1, _MOST_THREADS), 1)
         cubes, parent = around.levels[_LEVEL]
         full, cube_part = np.zeros((cubes.used, 8), np.uint64), np.empty(cubes.used, np.uint8)
         part = np.empty(around.used, np.uint8)
@@ -145,6 +146,9 @@ class Lookout:
     ) -> None:
         """Add what the beams of points, shape (n, 3), that lie in voxels, shape (n,), say of all voxels; in the order of time."""
         rays = _Rays(xyz_m, origins_m, self._around.elapsed_ms(time_ns), incidence_deg, voxel)
+        if self._threads == 1:
+            _look(rays, self._maps, self.evidence, 0)
+            return
         with ThreadPoolExecutor(self._threads) as pool:
             for done in [pool.submit(_look, rays, self._maps, self.evidence, each) for each in range(self._threads)]:
                 done.result()

@@ -32,7 +32,7 @@ def evidence(threads: int, monkeypatch: pytest.MonkeyPatch) -> freespace.Evidenc
 
 
 def test_threads_that_share_the_cubes_see_what_one_sees(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone, shared = evidence(1, monkeypatch), evidence(3, monkeypatch)
+    alone, shared = evidence(1, monkeypatch), evidence(4, monkeypatch)
     assert alone.open_looks.sum() > 1000
     for one, other in zip(alone, shared, strict=True):
         np.testing.assert_array_equal(one, other)
