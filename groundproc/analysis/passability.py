@@ -292,6 +292,7 @@ def work(task: Task, progress: Progress) -> Made:
         A file or a place is not as it should be.
     """
     cloud = reader.look(task.cloud)
+    _refuse_outside(task, cloud, progress)
     with made_folder(task.folder):
         floor = Floor(cloud, task.folder, progress)
         area = _Area(task, floor)
@@ -313,6 +314,25 @@ def work(task: Task, progress: Progress) -> Made:
         elif task.ends is not None:
             made.warnings.append("there is no way from --from to --to that the vehicle can go")
     return made
+
+
+def _refuse_outside(task: Task, cloud: reader.Cloud, progress: Progress) -> None:
+    """Refuse ends of a route beyond the cloud before its ground is looked for. A head may state wrong bounds, points do not."""
+    with reader.opened(cloud.path) as file:
+        low, high = file.header.mins[:2], file.header.maxs[:2]
+    slack = task.cell_m or _CELLS_M[-1]
+    for word, place in zip(("--from", "--to"), task.ends or (), strict=False):
+        if np.any(place < low - slack) or np.any(place > high + slack):
+            low, high = np.full(2, np.inf), np.full(2, -np.inf)
+            for chunk in reader.chunks(cloud, columns=()):
+                xy = chunk.points.xyz_m[:, :2]
+                low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
+                progress(len(xy))
+        if np.any(place < low - slack) or np.any(place > high + slack):
+            raise CoverageError(
+                f"{word} {place[0]:.2f},{place[1]:.2f}: lies outside of the cloud, which spans {low[0]:.0f} to {high[0]:.0f} E and "
+                f"{low[1]:.0f} to {high[1]:.0f} N"
+            )
 
 
 def _write_rasters(folder: Path, area: _Area) -> None:

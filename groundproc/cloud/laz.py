@@ -18,6 +18,7 @@ import lazrs
 from laspy._pointreader import IPointReader
 from laspy.errors import LaspyException
 
+from flightlog.errors import SourceError
 from groundproc.cloud import lazworker
 from groundproc.cloud.lazworker import Task
 
@@ -76,7 +77,7 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
     """
 
     def __init__(self, path: Path, source: Any, header: Any, vlr: bytes, most: int, parts: Parts | None = None) -> None:
-        self._source = source
+        self._path, self._source = path, source
         self._point_bytes = int(header.point_format.size)
         if (stated := int(lazrs.LazVlr(vlr).item_size())) != self._point_bytes:
             raise LaspyException(f"points of {stated} bytes are packed, expected {self._point_bytes} by the header")
@@ -108,7 +109,7 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
 
         Raises
         ------
-        LaspyException
+        LaspyException, SourceError
             They cannot be unpacked.
         """
         if not self._asked:
@@ -154,7 +155,7 @@ class Unpacker(IPointReader):  # type: ignore[misc]  # laspy has no types
         if answer == "ok\n":
             return
         if not answer:
-            answer = ended(self._child.wait())
+            answer = ended(self._child.wait(), self._path)
         raise LaspyException(answer.strip())
 
 
@@ -163,8 +164,19 @@ def _pipe(pipe: IO[str] | None) -> IO[str]:
     return pipe
 
 
-def ended(code: int) -> str:
-    """Why a process ended that said nothing."""
+def ended(code: int, path: Path) -> str:
+    """Why a process ended that unpacked points of a file, and said nothing.
+
+    Raises
+    ------
+    SourceError
+        That was not for the file's sake.
+    """
+    if -code in (signal.SIGTERM, getattr(signal, "SIGKILL", None)):
+        raise SourceError(
+            f"{path}: the process that unpacks its points was killed ({signal.Signals(-code).name}), by somebody or by a system that has "
+            "no memory left; the file may be sound"
+        )
     if code < 0 and signal.Signals(-code).name == "SIGXCPU":
         return "unpacking its points does not come to an end"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"

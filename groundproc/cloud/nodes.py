@@ -227,7 +227,7 @@ class NodeReader:
             child.communicate()
             self._child = laz.start(self._task)
             key = "-".join(map(str, node.key))
-            reason = answer.strip() or laz.ended(child.returncode)
+            reason = answer.strip() or laz.ended(child.returncode, self._cloud.path)
             raise CaptureError(f"{self._cloud.path}: node {key} is damaged ({reason})")
         return bytes(memoryview(self._memory)[: node.points * self._task.point_bytes])
 

@@ -42,7 +42,8 @@ def stoppable() -> Iterator[None]:
         yield
     finally:
         for number, handler in before:
-            signal.signal(number, handler)
+            # the system goes on to send it once a second
+            signal.signal(number, signal.SIG_IGN if number in _told and _repeats(number) else handler)
 
 
 @contextlib.contextmanager
@@ -62,6 +63,10 @@ def heard() -> Iterator[None]:
         if len(_told) > before:
             raise Stopped(_told[-1]) from None
         raise
+
+
+def _repeats(number: int) -> bool:
+    return number == getattr(signal, "SIGXCPU", None)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import rasterio
 import shapely
 
+from groundproc.analysis import passability
 from groundproc.analysis.passage.relief import planes, steps
 from groundproc.analysis.passage.route import best_route
 from groundproc.cli import main
@@ -230,3 +232,21 @@ def test_the_best_route_is_that_of_a_plain_search() -> None:
             continue
         spent = sum(np.hypot(*(b - a)) * (cost[tuple(a)] + cost[tuple(b)]) / 2 for a, b in itertools.pairwise(way))
         assert spent == pytest.approx(least[-1, -1])
+
+
+def test_a_place_beyond_the_cloud_is_refused_before_its_ground_is_looked_for(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def looked_for(*given: Any) -> None:
+        raise AssertionError("the ground is looked for")
+
+    monkeypatch.setattr(passability, "Floor", looked_for)
+    words = ["passability", str(made / "c.laz"), "-o", str(tmp_path / "out"), "--from", place(5, 10)]
+    assert main([*words, "--to", place(3000, 10)]) == 1
+    assert "lies outside of the cloud, which spans" in capsys.readouterr().err
+    # a head that states too little is not believed
+    head = bytearray((made / "c.laz").read_bytes())
+    struct.pack_into("<4d", head, 179, *(ORIGIN[0] + 1.0, ORIGIN[0], ORIGIN[1] + 1.0, ORIGIN[1]))
+    (tmp_path / "short.laz").write_bytes(head)
+    with pytest.raises(AssertionError, match="the ground is looked for"):
+        main(["passability", str(tmp_path / "short.laz"), *words[2:], "--to", place(10, 10)])

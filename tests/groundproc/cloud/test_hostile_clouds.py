@@ -6,12 +6,13 @@ import resource
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
 import pytest
 
-from flightlog.errors import CaptureError
+from flightlog.errors import CaptureError, SourceError
 from groundproc.cloud import laz, reader
 from groundproc.cloud.gpstime import Clock
 
@@ -176,3 +177,20 @@ def test_the_cases_that_aborted_are_one_sentence(cases: Path) -> None:
     for name in ("laz_abort.laz", "las_memory.las"):
         with pytest.raises(CaptureError, match="is damaged"):
             read(cases / "hostile" / name)
+
+
+def test_a_process_that_is_killed_is_no_damage(whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A system without memory kills the one that unpacks: the file may be sound."""
+    start = laz.start
+
+    def killed(task: Any) -> Any:
+        child = start(task)
+        child.kill()
+        child.wait()
+        return child
+
+    monkeypatch.setattr(laz, "start", killed)
+    path = tmp_path / "sound.laz"
+    path.write_bytes(whole)
+    with pytest.raises(SourceError, match=r"sound\.laz: the process that unpacks its points was killed \(SIGKILL\)"):
+        list(reader.chunks(reader.look(path)))
