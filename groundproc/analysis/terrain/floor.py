@@ -33,6 +33,8 @@ LEAST_DEPTH_M: Final = 0.5
 FILL_M: Final = 60.0
 """Halo of a block within which gaps are filled alike from both sides of its edge."""
 _BASE_CELLS: Final = 1.5
+_RIM: Final = 4
+"""Cells beyond the outermost points, from which the ground is told to points beside them."""
 
 
 class Floor:
@@ -128,11 +130,15 @@ class Floor:
             if not lowest.holds(_finer(block, times)):
                 continue
             values = _least(lowest, around, times)
-            if np.isfinite(cut(values)).any():
-                bare = bare_ground(values, settings)
-                self.height.put(block, cut(bare.height_m))
-                self.reach.put(block, cut(bare.reach_m))
-                self.base.put(block, cut(smoothed(bare.height_m, _BASE_CELLS)))
+            known = np.isfinite(values)
+            if cut(known).any():
+                # what lies beyond all points of a block and its halo is as what lies beyond the cloud: a corridor fills few of them
+                part = _occupied(known)
+                bare = bare_ground(values[part], settings)
+                smooth = smoothed(bare.height_m, _BASE_CELLS)
+                sheets = (self.height, bare.height_m), (self.reach, bare.reach_m), (self.base, smooth)
+                for sheet, found in sheets:
+                    sheet.put(block, cut(_beyond(found, part, known.shape)))
 
     def above(self, xyz: Array) -> npt.NDArray[np.float32]:
         """Height above the lowest ground, shape (n,)."""
@@ -171,6 +177,24 @@ def _least(cells: Cells, window: Window, times: int) -> npt.NDArray[np.float32]:
     values = cells.window(_finer(window, times), "min").reshape(window.rows, times, window.columns, times)
     low = np.where(np.isfinite(values), values, np.float32(np.inf)).min(axis=(1, 3))
     return np.where(np.isfinite(low), low, np.float32(np.nan))
+
+
+def _occupied(known: npt.NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns between the first and the last that hold anything, and a few more."""
+    ends = [
+        (np.flatnonzero(known.any(axis=axis))[[0, -1]], size)
+        for axis, size in ((1, known.shape[0]), (0, known.shape[1]))
+    ]
+    rows, columns = (slice(max(int(e[0]) - _RIM, 0), min(int(e[1]) + 1 + _RIM, size)) for e, size in ends)
+    return rows, columns
+
+
+def _beyond(
+    values: npt.NDArray[np.float32], part: tuple[slice, slice], shape: tuple[int, int]
+) -> npt.NDArray[np.float32]:
+    """A raster of which a part is known, with the nearest of that beyond."""
+    sides = [(each.start, size - each.stop) for each, size in zip(part, shape, strict=True)]
+    return np.pad(values, sides, mode="edge") if np.any(sides) else values
 
 
 def _coarser(grid: Window, times: int, cell_m: float) -> Grid:
