@@ -257,17 +257,38 @@ def base_motion(given: Given, leg: Leg, run: LidarRun) -> tuple[Motion, ImuTrack
     forces = [unit for unit in (own, other) if unit is not None and np.isfinite(unit.force_m_s2).all()]
     if not forces:
         raise LogError("adjusted: no accelerometer in the log, neither the lidar's nor the autopilot's (RAW_IMU)")
-    force, felt = on_grid(forces[0].time_ns, forces[0].force_m_s2, start_ns, steps)
     if base is own and other is not None and other.rate_hz >= LEAST_BASE_HZ:
         known = _filled(rate, known, *on_grid(other.time_ns, other.rate_rad_s, start_ns, steps))
-    if len(forces) > 1:
-        felt = _filled(force, felt, *on_grid(forces[1].time_ns, forces[1].force_m_s2, start_ns, steps))
+    # the lidar's accelerometer feels each bearing; the autopilot's is eight times quieter. One below 20 Hz misses gusts
+    forces.sort(key=lambda unit: (unit.rate_hz < LEAST_BASE_HZ, unit.force_density()))
+    felt_by = [on_grid(unit.time_ns, unit.force_m_s2, start_ns, steps) for unit in forces]
+    if other in forces:
+        at_ins, _ = felt_by[forces.index(other)]
+        bias = _offset(own, other, start_ns, steps) if base is own else np.zeros(3)
+        at_ins += lever_force(rate - bias, mat.T @ given.mount.lidar_position_m())
+    (force, felt), *others = felt_by
+    for second in others:
+        felt = _filled(force, felt, *second)
     known &= felt
     if known.any():  # a last step that is half known would leave the path's end without hold
         end = int(np.flatnonzero(known)[-1]) + 1
         rate, force, known = rate[:end], force[:end], known[:end]
     motion = Motion(start_ns, rate, force, known, base.rate_density(), forces[0].force_density(), base.name)
     return motion, own, other
+
+
+def lever_force(rate_rad_s: Array, lever_m: Array) -> Array:
+    """What a turning body accelerates at the end of a lever by beside its beginning, each grid step [m/s^2], shape (n, 3).
+
+    Parameters
+    ----------
+    rate_rad_s : ndarray, shape (n, 3)
+        Mean rates of the steps, less their bias.
+    lever_m : ndarray, shape (3,)
+        In the same axes.
+    """
+    turning = np.gradient(rate_rad_s, STEP_NS * 1e-9, axis=0)
+    return np.asarray(np.cross(turning, lever_m) + np.cross(rate_rad_s, np.cross(rate_rad_s, lever_m)))
 
 
 def _filled(
@@ -282,9 +303,16 @@ def _filled(
 
 def gyro_offset(motion: Motion, own: ImuTrack | None, other: ImuTrack | None) -> Array:
     """Where to begin with the bias of the gyro that carries the motion: its mean difference from the autopilot's, which has a small one."""
-    if own is None or other is None or motion.source != own.name:
+    if own is None or motion.source != own.name:
         return np.zeros(3)
-    rate, known = on_grid(other.time_ns, other.rate_rad_s, motion.start_ns, len(motion))
-    own_rate, own_known = on_grid(own.time_ns, own.rate_rad_s, motion.start_ns, len(motion))
+    return _offset(own, other, motion.start_ns, len(motion))
+
+
+def _offset(own: ImuTrack | None, other: ImuTrack | None, start_ns: int, steps: int) -> Array:
+    """Mean rate of the lidar's gyro less that of the autopilot's [rad/s], shape (3,); 0 where one is missing."""
+    if own is None or other is None:
+        return np.zeros(3)
+    rate, known = on_grid(other.time_ns, other.rate_rad_s, start_ns, steps)
+    own_rate, own_known = on_grid(own.time_ns, own.rate_rad_s, start_ns, steps)
     both = known & own_known
     return np.asarray((own_rate - rate)[both].mean(axis=0)) if both.any() else np.zeros(3)

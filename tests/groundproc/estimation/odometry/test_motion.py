@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flightlog.constants import NS_PER_S
 from groundproc.estimation.observations.fixes import RECOVERY_NS, measured
 from groundproc.estimation.odometry.grid import STEP_NS
-from groundproc.estimation.odometry.motion import LONGEST_SAMPLE_GAP_NS, on_grid
+from groundproc.estimation.odometry.motion import LONGEST_SAMPLE_GAP_NS, lever_force, on_grid
 
 Array = npt.NDArray[np.float64]
 STEP_S = STEP_NS * 1e-9
@@ -111,3 +112,21 @@ def test_without_a_word_on_satellites_all_positions_count() -> None:
     # a receiver that never tells of a fix: its positions are what there is
     assert measured(boot_with(np.zeros(50, np.int64)), time_ns).all()
     assert measured(boot_with(np.full(50, 3)), time_ns).all()
+
+
+def test_the_end_of_a_lever_is_felt_as_its_own_path_tells() -> None:
+    """Against second differences of the lever's end, of a body that nods and turns about a fixed place."""
+    step_s, lever = STEP_NS * 1e-9, np.array([0.1, -0.2, 0.3])
+    seconds = np.arange(-2, 803) * step_s
+    rotvec = np.stack(
+        [0.05 * np.sin(9.0 * seconds), 0.1 * np.sin(4.0 * seconds), 0.3 * seconds + 0.2 * seconds**2], axis=1
+    )
+    attitude = Rotation.from_euler("ZYX", rotvec[:, ::-1])
+    end = attitude.apply(lever)
+    felt = attitude[2:-2].inv().apply(np.diff(end, 2, axis=0)[1:-1] / step_s**2)
+    # the rate of a step is the turn over it; those before and after an instant average to the rate at it
+    rate = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / step_s
+    found = lever_force(rate, lever)
+    found = 0.5 * (found[1:-2] + found[2:-1])
+    # a second difference, and the mean of two steps, each leave out (w step)^2 / 6 of a swing at most
+    np.testing.assert_allclose(found[1:-1], felt[1:-1], rtol=0, atol=2 * (9.0 * step_s) ** 2 / 6 * np.abs(felt).max())
