@@ -31,8 +31,8 @@ from groundproc.trajectory.trajectory import Trajectory
 Array = npt.NDArray[np.float64]
 
 SETTLING: Final = (60, 150)
-"""Slices after which their first half, flown when there was no map, is run again against the map that there is now,
-and so stated late: six seconds where the lidar holds the path well, and up to fifteen where it does not."""
+"""Slices that are run again, against the map of their second half, for at the beginning there was none, and so are
+stated late: six seconds where the lidar holds the path well, and up to fifteen where it does not."""
 HELD_M: Final = 0.05
 """Sigma of the least observed direction of a slice, in the last second, from which on it holds the path well."""
 
@@ -125,7 +125,8 @@ def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory
         if tracker.keep and tracker.track is not None and tracker.odometry is not None:
             early.append(piece)
             if _is_settled(tracker.track):
-                redo_beginning(tracker.track, motion, early, tracker.odometry, len(tracker.track) // 2)
+                whole = len(tracker.track)
+                redo_beginning(tracker.track, motion, early, tracker.odometry, whole, mapped=whole // 2)
                 tracker.keep = False
                 tracker.track.forget(len(tracker.track))
                 early.clear()

@@ -31,7 +31,8 @@ SURE_M: Final = 0.15
 
 
 def redo_beginning(
-    track: Track, motion: Motion, early: Sequence[Slice], before: Odometry, count: int | None = None, turns: bool = True
+    track: Track, motion: Motion, early: Sequence[Slice], before: Odometry, count: int | None = None,
+    mapped: int | None = None, turns: bool = True,
 ) -> None:  # fmt: skip
     """Run the first slices again and put the result into the track.
 
@@ -45,6 +46,8 @@ def redo_beginning(
         As it is at the end of the track: biases, gravity and the line of the spin are known by then.
     count : int, optional
         Slices that are run again; where left out `BEGINNING`, and no more than a third of a track that is short.
+    mapped : int, optional
+        From which slice on the map is taken; where left out, from `count` on.
     turns : bool
         Whether the turns within these slices are found: a batch does not use them.
     """
@@ -66,7 +69,7 @@ def redo_beginning(
     )  # fmt: skip
     line = None if before.line is None else before.line.reversed()
     odometry = Odometry(begin, reversed_motion, 0, track.voxel_m, line, turns, beside=True)
-    odometry.planes = _map_of(track, motion, count, min(count + AFTER, len(track)))
+    odometry.planes = _map_of(track, motion, count if mapped is None else mapped, min(count + AFTER, len(track)))
     found: dict[int, tuple[State, Step | None]] = {}
     for piece in reversed(early):
         k = piece.number - track.first
