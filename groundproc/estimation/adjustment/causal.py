@@ -114,7 +114,7 @@ class CausalRun:
 
 def causal_run(given: Given, legs: Sequence[Leg], number: int, start: Trajectory, progress: Progress) -> CausalRun:
     """Odometry over one run of the lidar's clock, nothing of the future used but the gyro's offset."""
-    motion, own, other = base_motion(given, legs[0], given.flight.runs[number])
+    motion, own, other = base_motion(given, legs[0], given.flight.runs[number], quieter=True)
     positions = position_track(given, legs[0])
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     stated = Recorded(positions, attitude_track(legs[0]))

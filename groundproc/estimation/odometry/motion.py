@@ -232,8 +232,18 @@ def on_grid(time_ns: Times, values: Array, start_ns: int, steps: int) -> tuple[A
     return np.diff(total, axis=0) / (STEP_NS * 1e-9), inside[:-1] & inside[1:]
 
 
-def base_motion(given: Given, leg: Leg, run: LidarRun) -> tuple[Motion, ImuTrack | None, ImuTrack | None]:
+def base_motion(
+    given: Given, leg: Leg, run: LidarRun, quieter: bool = False
+) -> tuple[Motion, ImuTrack | None, ImuTrack | None]:
     """The motion between revolutions, from the lidar's own unit where it is there, else from the autopilot's; and both units.
+
+    Parameters
+    ----------
+    given : Given
+    leg : Leg
+    run : LidarRun
+    quieter : bool
+        Whether forces come from the accelerometer of less noise, moved to the lidar; else from the lidar's own, where it is there.
 
     Raises
     ------
@@ -259,10 +269,11 @@ def base_motion(given: Given, leg: Leg, run: LidarRun) -> tuple[Motion, ImuTrack
         raise LogError("adjusted: no accelerometer in the log, neither the lidar's nor the autopilot's (RAW_IMU)")
     if base is own and other is not None and other.rate_hz >= LEAST_BASE_HZ:
         known = _filled(rate, known, *on_grid(other.time_ns, other.rate_rad_s, start_ns, steps))
-    # the lidar's accelerometer feels each bearing; the autopilot's is eight times quieter. One below 20 Hz misses gusts
-    forces.sort(key=lambda unit: (unit.rate_hz < LEAST_BASE_HZ, unit.force_density()))
+    if quieter:
+        # the lidar's accelerometer feels each bearing; the autopilot's is eight times quieter. One below 20 Hz misses gusts
+        forces.sort(key=lambda unit: (unit.rate_hz < LEAST_BASE_HZ, unit.force_density()))
     felt_by = [on_grid(unit.time_ns, unit.force_m_s2, start_ns, steps) for unit in forces]
-    if other in forces:
+    if quieter and other in forces:
         at_ins, _ = felt_by[forces.index(other)]
         bias = _offset(own, other, start_ns, steps) if base is own else np.zeros(3)
         at_ins += lever_force(rate - bias, mat.T @ given.mount.lidar_position_m())
