@@ -19,6 +19,7 @@ from flightlog.errors import ConfigError
 from flightlog.mount import Mount
 from groundproc.cloud import cleaning, freespace
 from groundproc.cloud.beams import Beams
+from groundproc.cloud.mixing import Mixing
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import Errors, MountErrors
 from groundproc.cloud.surroundings import Surroundings
@@ -160,20 +161,22 @@ def described(stream: Stream, scene: Scene, names: frozenset[str], found: Found 
             classes = cleaning.classify(around, _looked(around, itertools.islice(along, pieces), scene))
             found.stretches.append(classes.of_stretch)
         around.keep_planes_only()
+        mixing = Mixing(around) if classes is not None and classes.of_stretch.trusted else None
         give_back_memory()  # while points are handed on, the products take the most
         for points in itertools.islice(behind, pieces):
-            points = _with_attributes(points, scene, names, _Known(around, classes))
+            points = _with_attributes(points, scene, names, _Known(around, classes, mixing))
             found.add(points)
             yield points
-        del around, classes  # the next stretch takes their memory
+        del around, classes, mixing  # the next stretch takes their memory
 
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """What lies around the points of a stretch, and the classes of its voxels where they are asked for."""
+    """What lies around the points of a stretch; where asked for, classes of its voxels and, if these are trusted, what is mixed."""
 
     around: Surroundings
     classes: cleaning.Classes | None
+    mixing: Mixing | None
 
 
 def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Looks:
@@ -229,9 +232,9 @@ def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known:
         if known.classes is not None:
             columns["classification"] = known.classes.of_voxel[voxel]
             columns["mixed"] = (
-                cleaning.mixed(known.around, points.xyz_m, origins, voxel)
-                if known.classes.of_stretch.trusted
-                else np.zeros(len(points), np.uint8)
+                np.zeros(len(points), np.uint8)
+                if known.mixing is None
+                else known.mixing.of(points.xyz_m, origins, voxel)
             )
     if "sigma" in names:
         errors = Errors.of(points.time_ns, scene.trajectory, scene.mount, scene.mount_errors)

@@ -1,4 +1,4 @@
-"""Classes that cleaning gives: what moved, noise, and echoes that are mixed of two surfaces. No point is deleted.
+"""Classes that cleaning gives: what moved, and noise (`mixing` has echoes that are mixed of two surfaces). No point is deleted.
 
 Moving is what beams passed through before or after it was hit (`freespace`). A single such voxel may be a leaf, so a beginning needs
 company; from there it grows to neighbours that any beam contradicts, and to what belongs to no surface and was hit at the same time only.
@@ -17,11 +17,8 @@ from numba import njit
 from groundproc.cloud.classes import HIGH_NOISE, LOW_NOISE, MOVING, UNCLASSIFIED
 from groundproc.cloud.freespace import AFTER, BEFORE, BETWEEN, SAME, Looks
 from groundproc.cloud.surroundings import Surroundings, has_plane, off_plane
-from groundproc.cloud.voxels import Voxels, beside, find, middle_of
-from groundproc.numerics.voxelhash import voxel_key
+from groundproc.cloud.voxels import Voxels, beside, find
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 Bytes = npt.NDArray[np.uint8]
 
 SEED_LOOKS: Final = 8
@@ -60,11 +57,6 @@ _GROUND_POINTS: Final = 20
 
 _EDGE, _NEW, _INSIDE = 1, 2, 3
 """Of what moves: grown to in the last round, in this one, before."""
-
-REACH_M: Final = 0.6
-"""Surfaces nearer to each other than this give one echo, in between (FOI-R--4045--SE, appendix B)."""
-OFF_M: Final = 0.05
-"""A mixed echo lies so far from both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +107,6 @@ def classify(around: Surroundings, looks: Looks) -> Classes:
         _grow(around.table, around.voxels, looks, moving, True)
     classes[moving > 0] = MOVING
     return Classes(classes, Stretch(share, trusted))
-
-
-def mixed(around: Surroundings, xyz_m: Array, origins_m: Array, voxel: Ints) -> Bytes:
-    """1 where a point lies between two surfaces that its beam meets within the length of a pulse, shape (n,)."""
-    out = np.zeros(len(xyz_m), np.uint8)
-    _mixed(xyz_m, origins_m, voxel, around.table, around.voxels, around.edge_m, out)
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -244,68 +229,3 @@ def _grow(table: Any, voxels: Voxels, looks: Any, moving: Any, by_time: bool) ->
         elif moving[w] == _NEW:
             moving[w] = _EDGE
     return grown
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _along_to_plane(voxels: Voxels, w: int, edge_m: float, ray: Any) -> Any:
-    """Distance along a ray, six numbers, to the plane of a voxel.
-
-    Numbers, and no rows of arrays: for each row that it takes numba counts a reference, at three times the cost of the rest.
-    """
-    ox, oy, oz, ux, uy, uz = ray
-    cx, cy, cz = middle_of(voxels.key[w], edge_m)
-    s, n = voxels.sums, voxels.normal
-    slope = n[w, 0] * ux + n[w, 1] * uy + n[w, 2] * uz
-    if abs(slope) < 0.05:
-        return -1.0
-    top = n[w, 0] * (cx + s[w, 1] / s[w, 0] - ox)
-    top += n[w, 1] * (cy + s[w, 2] / s[w, 0] - oy)
-    top += n[w, 2] * (cz + s[w, 3] / s[w, 0] - oz)
-    return top / slope
-
-
-@njit(cache=True, nogil=True)
-def _between(ray: Any, length: float, table: Any, voxels: Voxels, edge_m: float) -> Any:
-    """Whether a ray meets a surface before and another behind a length, no farther from each other than a pulse is long.
-
-    A beam is wide, so what is in the voxel beside it counts.
-    """
-    ox, oy, oz, ux, uy, uz = ray
-    neighbours = np.empty(27, np.int64)
-    steps = int(np.ceil(REACH_M / edge_m))
-    nearer, beyond = -np.inf, np.inf
-    for each in range(
-        2 * steps + 1
-    ):  # from the point outwards: most have a surface through them, which ends the search
-        step = (each + 1) // 2 if each % 2 else -(each // 2)
-        at = length + step * edge_m
-        x, y, z = ox + at * ux, oy + at * uy, oz + at * uz
-        for n in range(_around(table, voxels.key, voxel_key(x, y, z, 1.0 / edge_m), neighbours)):
-            w = neighbours[n]
-            if not has_plane(voxels.normal, w):
-                continue
-            met = _along_to_plane(voxels, w, edge_m, ray)
-            if abs(met - at) > edge_m:
-                continue
-            if abs(met - length) <= OFF_M:
-                return False  # a surface passes through the point
-            if met < length:
-                nearer = max(nearer, met)
-            else:
-                beyond = min(beyond, met)
-    return beyond - nearer < REACH_M + 2.0 * OFF_M
-
-
-@njit(cache=True, nogil=True)
-def _mixed(xyz: Any, origin: Any, voxel: Any, table: Any, voxels: Voxels, edge_m: float, out: Any) -> None:
-    for n in range(len(xyz)):
-        ox, oy, oz = origin[n, 0], origin[n, 1], origin[n, 2]
-        ux, uy, uz = xyz[n, 0] - ox, xyz[n, 1] - oy, xyz[n, 2] - oz
-        length = np.sqrt(ux * ux + uy * uy + uz * uz)
-        if length < REACH_M:
-            continue
-        ray = ox, oy, oz, ux / length, uy / length, uz / length
-        v = voxel[n]
-        if has_plane(voxels.normal, v) and abs(_along_to_plane(voxels, v, edge_m, ray) - length) < OFF_M:
-            continue
-        out[n] = _between(ray, length, table, voxels, edge_m)
