@@ -33,8 +33,8 @@ LEAST_DEPTH_M: Final = 0.5
 FILL_M: Final = 60.0
 """Halo of a block within which gaps are filled alike from both sides of its edge."""
 _BASE_CELLS: Final = 1.5
-_RIM: Final = 4
-"""Cells beyond the outermost points, from which the ground is told to points beside them."""
+_RIM_M: Final = 6.0
+"""Beyond the outermost points of a block: models of the ground reach 5 m beyond them."""
 
 
 class Floor:
@@ -133,7 +133,7 @@ class Floor:
             known = np.isfinite(values)
             if cut(known).any():
                 # what lies beyond all points of a block and its halo is as what lies beyond the cloud: a corridor fills few of them
-                part = _occupied(known)
+                part = _occupied(known, round(_RIM_M / settings.cell_m))
                 bare = bare_ground(values[part], settings)
                 smooth = smoothed(bare.height_m, _BASE_CELLS)
                 sheets = (self.height, bare.height_m), (self.reach, bare.reach_m), (self.base, smooth)
@@ -179,13 +179,13 @@ def _least(cells: Cells, window: Window, times: int) -> npt.NDArray[np.float32]:
     return np.where(np.isfinite(low), low, np.float32(np.nan))
 
 
-def _occupied(known: npt.NDArray[np.bool_]) -> tuple[slice, slice]:
+def _occupied(known: npt.NDArray[np.bool_], rim: int) -> tuple[slice, slice]:
     """Rows and columns between the first and the last that hold anything, and a few more."""
     ends = [
         (np.flatnonzero(known.any(axis=axis))[[0, -1]], size)
         for axis, size in ((1, known.shape[0]), (0, known.shape[1]))
     ]
-    rows, columns = (slice(max(int(e[0]) - _RIM, 0), min(int(e[1]) + 1 + _RIM, size)) for e, size in ends)
+    rows, columns = (slice(max(int(e[0]) - rim, 0), min(int(e[1]) + 1 + rim, size)) for e, size in ends)
     return rows, columns
 
 
