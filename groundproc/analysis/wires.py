@@ -18,7 +18,7 @@ from groundproc.analysis.corridor.catenary import Catenary
 from groundproc.analysis.corridor.chains import chained
 from groundproc.analysis.corridor.clearance import Clearance
 from groundproc.analysis.corridor.poles import HALO_M, Pole, upright
-from groundproc.analysis.corridor.spans import attached, conductors
+from groundproc.analysis.corridor.spans import attached, box_of, conductors, touching
 from groundproc.analysis.corridor.strips import FENCE_HEIGHTS_M, fences, low_strips, stay
 from groundproc.analysis.corridor.thin import RADIUS_M, thin_points
 from groundproc.analysis.corridor.whole import Whole
@@ -59,6 +59,8 @@ _LOWEST_M: Final = 0.8
 _GROWTH_M: Final = 40.0
 """Growth further away is not told of."""
 _LEVEL: Final = 0.7
+_GUARD_REACH_M: Final = 8.0
+"""To the side of others of its span ..."""
 _GUARD_M: Final = 1.5
 """A wire that hangs so much above all others of its span, by itself or with one more, is a guard."""
 
@@ -205,14 +207,16 @@ def _sort_lines(task: Task, floor: Floor, xyz_m: Array, direction: Array, made: 
 def _guards(wires: list[Catenary]) -> list[bool]:
     """Wires that hang well above two or more others of their span."""
     out = []
+    boxes = np.array([box_of(each.along_plan()) for each in wires]).reshape(-1, 4)
     for wire in wires:
         middle = wire.between(wire.start_m, wire.middle_of).places(1e9)[-1]
         below, beside = 0, 0
-        for other in wires:
+        for number in touching(boxes, box_of(middle[None]), _GUARD_REACH_M):
+            other = wires[number]
             s, off, up = other.local(middle[None])
             if (
                 other is not wire
-                and abs(off[0]) < 8.0
+                and abs(off[0]) < _GUARD_REACH_M
                 and other.start_m < s[0] < other.end_m
                 and abs(wire.along @ other.along) > 0.99
             ):

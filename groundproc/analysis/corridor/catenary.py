@@ -74,6 +74,11 @@ class Catenary:
         s = np.linspace(self.start_m, self.end_m, max(int(np.ceil(self.length_m / step_m)), 1) + 1)
         return np.column_stack([self.origin_m + s[:, None] * self.along, self.height(s)])
 
+    def along_plan(self, beyond_m: float = 0.0) -> Array:
+        """Places in plan so far beyond its ends, shape (2, 2)."""
+        ends = np.array([self.start_m - beyond_m, self.end_m + beyond_m])
+        return np.asarray(self.origin_m + ends[:, None] * self.along)
+
     def between(self, start_m: float, end_m: float) -> "Catenary":
         """The same curve between other ends."""
         return Catenary(

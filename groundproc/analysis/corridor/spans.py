@@ -204,20 +204,25 @@ def joined(pieces: Sequence[Array]) -> list[Array]:
     """Pieces of one conductor put together, where no point was met for some metres between them."""
     left = sorted((each for each in pieces if len(each) >= _LEAST_PIECE), key=len, reverse=True)
     curves = [fitted(each) for each in left]
+    boxes = np.array([box_of(each) for each in left]).reshape(-1, 4)
     out = []
     while left:
-        points, curve = left.pop(0), curves.pop(0)
+        points, curve, boxes = left.pop(0), curves.pop(0), boxes[1:]
         # the nearest first: with one of the next span, beyond a piece of its own, a wire may seem to be one wide curve
-        while found := min(_continuing(points, curve, left, curves), key=lambda each: each.gap_m, default=None):
+        while found := min(_continuing(points, curve, left, curves, boxes), key=lambda each: each.gap_m, default=None):
             points, curve = np.concatenate([points, left.pop(found.number)]), found.both
             curves.pop(found.number)
+            boxes = np.delete(boxes, found.number, axis=0)
         out.append(points)
     return out
 
 
-def _continuing(points: Array, curve: Catenary, left: list[Array], curves: list[Catenary]) -> Iterator[_Joint]:
+def _continuing(
+    points: Array, curve: Catenary, left: list[Array], curves: list[Catenary], boxes: Array
+) -> Iterator[_Joint]:
     """The pieces that are of one curve with another."""
-    for number, (others, other) in enumerate(zip(left, curves, strict=True)):
+    for number in touching(boxes, box_of(points), 2.0 * _JOIN_M).tolist():
+        others, other = left[number], curves[number]
         s, off, up = curve.local(others)
         gap = max(s.min() - curve.end_m, curve.start_m - s.max())
         if gap > _JOIN_M:
@@ -239,24 +244,54 @@ def settled(pieces: Sequence[Array]) -> list[Array]:
     """
     whole = sorted((each for each in pieces if len(each) >= _LEAST_PIECE), key=len, reverse=True)
     for _ in range(_SETTLING):
-        curves: list[Catenary] = []
+        curves, boxes = list[Catenary](), np.empty((len(whole), 4))
         for curve, points in zip(map(fitted, whole), whole, strict=True):
-            if not any(np.median(_apart(each, points)) < SAME_M for each in curves):
+            near = touching(boxes[: len(curves)], box_of(points), SAME_M)
+            if not any(np.median(_apart(curves[n], points)) < SAME_M for n in near):
+                boxes[len(curves)] = box_of(curve.along_plan(_beyond_m(curve)))
                 curves.append(curve)
         if not curves:
             return []
-        pool = np.concatenate(whole)
-        apart = np.array([_apart(each, pool) for each in curves])
-        nearest = np.where(apart.min(axis=0) < _OWN_M, apart.argmin(axis=0), -1)
-        whole = [pool[nearest == number] for number in range(len(curves))]
+        whole = _shared(curves, boxes, np.concatenate(whole))
         whole = sorted((each for each in whole if len(each) >= _LEAST_PIECE), key=len, reverse=True)
     return whole
+
+
+def _shared(curves: Sequence[Catenary], boxes: Array, pool: Array) -> list[Array]:
+    """Points by the curve that each is nearest to; those of none are left out."""
+    order = np.argsort(pool[:, 0], kind="stable")
+    east = pool[order, 0]
+    best, nearest = np.full(len(pool), _OWN_M), np.full(len(pool), -1)
+    for number, (curve, (west, south, east_end, north)) in enumerate(zip(curves, boxes.tolist(), strict=False)):
+        some = order[np.searchsorted(east, west - _OWN_M) : np.searchsorted(east, east_end + _OWN_M, "right")]
+        some = some[(pool[some, 1] >= south - _OWN_M) & (pool[some, 1] <= north + _OWN_M)]
+        apart = _apart(curve, pool[some])
+        nearer = apart < best[some]
+        best[some[nearer]], nearest[some[nearer]] = apart[nearer], number
+    order = np.argsort(nearest, kind="stable")
+    return np.split(pool[order], np.searchsorted(nearest[order], np.arange(len(curves) + 1)))[1:-1]
+
+
+def box_of(places_m: Array) -> Array:
+    """West, south, east and north of places."""
+    return np.concatenate([places_m[:, :2].min(axis=0), places_m[:, :2].max(axis=0)])
+
+
+def touching(boxes: Array, box: Array, within_m: float) -> npt.NDArray[np.int64]:
+    """Numbers of the boxes, shape (n, 4), that come so near to one: a line of many spans is looked at span by span."""
+    near = (boxes[:, :2] <= box[2:] + within_m).all(axis=1) & (boxes[:, 2:] >= box[:2] - within_m).all(axis=1)
+    return np.flatnonzero(near)
+
+
+def _beyond_m(wire: Catenary) -> float:
+    """How far beyond its ends a curve takes points."""
+    return _NEXT_M + 2.0 * wire.length_m / wire.points
 
 
 def _apart(wire: Catenary, points_m: Array) -> Array:
     """Distances of points from a curve, across it; beyond its ends infinite."""
     s, off, up = wire.local(points_m)
-    reach = _NEXT_M + 2.0 * wire.length_m / wire.points
+    reach = _beyond_m(wire)
     return np.where((s > wire.start_m - reach) & (s < wire.end_m + reach), np.hypot(off, up), np.inf)
 
 
@@ -273,9 +308,11 @@ def _sound(wire: Catenary, points_m: Array) -> bool:
 def attached(wires: Sequence[Catenary], poles: Sequence[Pole]) -> list[Catenary]:
     """Wires as far as where they hang: at a pole beside the end, or where the next span's curve meets its own."""
     ends = [(wire, end, sign) for wire in wires for end, sign in ((wire.start_m, -1.0), (wire.end_m, 1.0))]
-    meetings = [_at_wire(wire, end, sign, wires) for wire, end, sign in ends]
+    tips = np.array([each.places(1e9) for each in wires]).reshape(-1, 2, 3)
+    meetings = [_at_wire(wire, end, sign, wires, tips) for wire, end, sign in ends]
+    feet = np.array([(each.x, each.y, each.foot_m) for each in poles]).reshape(-1, 3)
     beside = [
-        _beside(wire, end, poles, end if met is None or met.turn < _TELLING else met.s_m)
+        _beside(wire, end, poles, feet, end if met is None or met.turn < _TELLING else met.s_m)
         for (wire, end, _), met in zip(ends, meetings, strict=True)
     ]
     carried = Counter(min(each).number for each in beside if each)
@@ -300,14 +337,14 @@ def _reach_m(wire: Catenary) -> float:
     return 3.0 + 0.12 * wire.length_m
 
 
-def _beside(wire: Catenary, end: float, poles: Sequence[Pole], about: float) -> list[_Bearer]:
+def _beside(wire: Catenary, end: float, poles: Sequence[Pole], feet: Array, about: float) -> list[_Bearer]:
     """Poles that may bear an end, of which it is known about where it hangs."""
+    s, off, up = wire.local(feet)
     found = []
-    for number, pole in enumerate(poles):
-        s, off, up = wire.local(np.array([[pole.x, pole.y, pole.foot_m]]))
-        high = -float(up[0])
-        if abs(off[0]) <= pole.arm_m and abs(s[0] - end) < _reach_m(wire) and high < pole.height_m + 2.5:
-            found.append(_Bearer(abs(float(s[0]) - about), number, float(s[0]), abs(float(off[0]))))
+    for number in np.flatnonzero(np.abs(s - end) < _reach_m(wire)).tolist():
+        pole, aside = poles[number], abs(float(off[number]))
+        if aside <= pole.arm_m and -up[number] < pole.height_m + 2.5:
+            found.append(_Bearer(abs(float(s[number]) - about), number, float(s[number]), aside))
     return found
 
 
@@ -319,7 +356,7 @@ def _support(beside: list[_Bearer], carried: Counter[int]) -> _Bearer | None:
     return max(some, key=lambda each: (carried[each.number], -each.away_m))
 
 
-def _at_wire(wire: Catenary, end: float, sign: float, wires: Sequence[Catenary]) -> _Meeting | None:
+def _at_wire(wire: Catenary, end: float, sign: float, wires: Sequence[Catenary], tips: Array) -> _Meeting | None:
     """Where another curve goes on: that whose own end is nearest, for those beside it in a bundle meet it too, further on.
 
     Neither goes on beyond that place: a drop from the same pole may cross a conductor in plan before both end.
@@ -327,11 +364,9 @@ def _at_wire(wire: Catenary, end: float, sign: float, wires: Sequence[Catenary])
     reach = _reach_m(wire)
     here = np.append(wire.origin_m + end * wire.along, wire.height(np.array([end]))[0])
     found: _Meeting | None = None
-    for other in wires:
+    for number in np.flatnonzero(np.linalg.norm(tips - here, axis=2).min(axis=1) <= reach).tolist():
+        other = wires[number]
         if other is wire:
-            continue
-        tips = other.between(other.start_m, other.end_m).places(1e9)
-        if np.linalg.norm(tips - here, axis=1).min() > reach:
             continue
         s = end + sign * np.linspace(-0.1 * reach, reach, 201)
         places = np.column_stack([wire.origin_m + s[:, None] * wire.along, wire.height(s)])
