@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from groundproc.analysis.corridor import spans
 from groundproc.analysis.corridor.catenary import Catenary
 from groundproc.analysis.corridor.poles import Pole, upright
-from groundproc.analysis.corridor.spans import attached
+from groundproc.analysis.corridor.spans import attached, conductors
 from groundproc.analysis.corridor.whole import Whole
 from groundproc.analysis.terrain.building import roofs
 
@@ -90,3 +91,23 @@ def test_wires_on_the_edges_of_cells_are_no_roof_and_a_house_is_one(over_water: 
     found = roofs(top, ground, low, 0.5)
     assert not found[rows].any()
     assert found[10:20, 30:45].mean() > 0.95
+
+
+def test_spans_of_a_long_line_are_compared_with_those_near_them_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, apart = [], spans._apart
+
+    def counted(wire: Catenary, points_m: np.ndarray) -> np.ndarray:
+        calls.append(len(points_m))
+        return apart(wire, points_m)
+
+    monkeypatch.setattr(spans, "_apart", counted)
+    rng = np.random.default_rng(5)
+    chains = []
+    for number in range(24):
+        s = np.linspace(0.0, 50.0, 60)
+        z = 12.0 + 200.0 * (np.cosh((s - 25.0) / 200.0) - 1.0)
+        chains.append(np.column_stack([50.0 * number + s, 0.3 * (50.0 * number + s), z]) + rng.normal(0, 0.02, (60, 3)))
+    assert len(conductors(chains)) == 24
+    # four times each with itself and what is beside it
+    assert len(calls) < 4 * 24 * 5
+    assert sum(calls) < 4 * 24 * 5 * 60
