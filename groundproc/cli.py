@@ -1,6 +1,8 @@
 """`swath`: finds its commands by entry points, runs one, and turns errors of the outside world into one sentence."""
 
 import argparse
+import atexit
+import gc
 import os
 import re
 import signal
@@ -53,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `swath` and give its exit code: 0, 1 for what went wrong outside, 2 for a wrong command line."""
     words = list(sys.argv[1:] if argv is None else argv)
     _make_legible()
+    _end_soon()
     try:
         with stoppable():
             code = _dispatch(words)
@@ -71,6 +74,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         sentence, code = _outside(error)
         _say(sentence)
     return code
+
+
+@cache
+def _end_soon() -> None:
+    """At the end of the program the collector looks for rings in all that was loaded, for more than half a second: it is not to."""
+    atexit.register(gc.freeze)
 
 
 def _make_legible() -> None:

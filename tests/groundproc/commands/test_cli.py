@@ -43,6 +43,18 @@ def test_a_wrong_command_line_ends_with_2(words: list[str], capsys: pytest.Captu
     assert "Traceback" not in capsys.readouterr().err
 
 
+def test_the_collector_has_nothing_to_look_through_at_the_end() -> None:
+    code = """if True:
+        import atexit, gc
+        from groundproc.cli import main
+        atexit.register(lambda: print(len(gc.get_objects()) < gc.get_freeze_count() > 10_000))  # after what comes later
+        main(["--version"])
+        assert gc.get_freeze_count() == 0
+    """
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-1] == "True"
+
+
 def test_no_command_shows_the_help_and_ends_with_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "import" in capsys.readouterr().err
