@@ -134,16 +134,20 @@ def of_cloud(
     if classes is not None and not classed:
         raise CoverageError(f"{path}: its points have no classes, expected classes {', '.join(map(str, classes))}")
     sums = [_Sums(line) for line in lines]
+    present = np.zeros(256, np.bool_)
     for chunk in reader.chunks(cloud, columns=("classification",) if classed else ()):
         xyz = chunk.points.xyz_m
         if classed:
             kind = chunk.points["classification"]
+            present[kind] = True
             xyz = xyz[np.isin(kind, classes) if classes is not None else ~np.isin(kind, NO_SURFACE)]
         for each in sums:
             each.add(xyz, width_m)
         progress(len(chunk.points.xyz_m))
     if not any(each.count.any() for each in sums):
-        raise CoverageError(f"{path}: no point lies within {width_m / 2.0:g} m of a line")
+        of = "" if classes is None else f" of classes {', '.join(map(str, classes))}"
+        there = "" if classes is None else f"; the cloud has classes {', '.join(map(str, np.flatnonzero(present)))}"
+        raise CoverageError(f"{path}: no point{of} lies within {width_m / 2.0:g} m of a line{there}")
     return [each.profile(path.name) for each in sums]
 
 

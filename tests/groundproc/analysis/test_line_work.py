@@ -94,6 +94,18 @@ def test_a_profile_of_a_raster_is_the_plane_it_was_made_of(tmp_path: Path) -> No
     assert np.nanmax(np.abs(height - plane(x, y))) < 0.5 * CELL * 0.05 + 1e-3
 
 
+def test_a_profile_of_a_class_that_no_point_has_says_which_there_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, _, _ = cloud(tmp_path / "c.laz")
+    line = f"{WEST + 5},{NORTH - 5},{WEST + 95},{NORTH - 95}"
+    words = ["profile", str(path), "--line", line, "--classes", "6,9", "-o", str(tmp_path / "p.csv")]
+    assert main(words) == 1
+    assert "no point of classes 6, 9 lies within" in (said := capsys.readouterr().err)
+    assert "the cloud has classes 1, 2, 18" in said
+    assert said.count("\n") == 1
+
+
 def test_a_profile_of_a_cloud_has_mean_scatter_and_classes(tmp_path: Path) -> None:
     path, xyz, kind = cloud(tmp_path / "c.laz")
     shapes = np.array([shapely.LineString([(WEST + 5, NORTH - 5), (WEST + 95, NORTH - 95)])], object)
