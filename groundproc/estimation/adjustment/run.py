@@ -243,7 +243,11 @@ class Run:
             "restarts": self.track.restarts,
             "rejoined": self.track.rejoined,
             "apart": self.track.apart,
-            "loops": [loop for window in self.windows for loop in window.loops],
+            "loops": [
+                loop | {name: loop[name] + window.first * H for name in ("seen_s", "again_s")}
+                for window in self.windows
+                for loop in window.loops
+            ],
             "beside": sum(window.beside for window in self.windows),
             "windows": [
                 {"start_s": w.first * H, "seconds": (w.last - w.first) * H, "rounds": w.log} for w in self.windows
