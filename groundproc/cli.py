@@ -55,7 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `swath` and give its exit code: 0, 1 for what went wrong outside, 2 for a wrong command line."""
     words = list(sys.argv[1:] if argv is None else argv)
     _make_legible()
-    _end_soon()
+    if argv is None:  # this is the program, not a call from another one, whose end is its own
+        _end_soon()
     try:
         with stoppable():
             code = _dispatch(words)
@@ -76,7 +77,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-@cache
 def _end_soon() -> None:
     """At the end of the program the collector looks for rings in all that was loaded, for more than half a second: it is not to."""
     atexit.register(gc.freeze)
