@@ -52,7 +52,7 @@ def test_the_collector_has_nothing_to_look_through_at_the_end() -> None:
         assert gc.get_freeze_count() == 0
     """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.splitlines()[-1] == "True"
+    assert run.stdout.splitlines()[-1] == str(frozen)
 
 
 def test_no_command_shows_the_help_and_ends_with_2(capsys: pytest.CaptureFixture[str]) -> None:
