@@ -43,12 +43,15 @@ def test_a_wrong_command_line_ends_with_2(words: list[str], capsys: pytest.Captu
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_the_collector_has_nothing_to_look_through_at_the_end() -> None:
-    code = """if True:
-        import atexit, gc
+@pytest.mark.parametrize(("given", "frozen"), [("", True), ('["--version"]', False)])
+def test_the_collector_has_nothing_to_look_through_at_the_program_s_end(given: str, frozen: bool) -> None:
+    """Another program that calls this one ends as it likes."""
+    code = f"""if True:
+        import atexit, gc, sys
         from groundproc.cli import main
         atexit.register(lambda: print(len(gc.get_objects()) < gc.get_freeze_count() > 10_000))  # after what comes later
-        main(["--version"])
+        sys.argv[1:] = ["--version"]
+        main({given})
         assert gc.get_freeze_count() == 0
     """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
