@@ -21,7 +21,7 @@ from groundproc.raster import geotiff
 from groundproc.raster.cells import Cells
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
-from groundproc.raster.relief import filled
+from groundproc.raster.relief import filled_by_bands
 
 Array = npt.NDArray[np.float64]
 
@@ -68,7 +68,7 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
         return voxelsight.run(task, progress)
     surface = _surface(task, progress)
     places = _places(task, surface)
-    seen = np.zeros(surface.height_m.shape, np.float32)
+    seen = np.zeros(surface.height_m.shape, np.min_scalar_type(len(places)))
     known = np.zeros(surface.height_m.shape, np.bool_)
     above, target = (task.target_m, task.height_m) if task.reverse else (task.height_m, task.target_m)
     unit = surface.unit
@@ -82,7 +82,6 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
         known |= one != UNKNOWN
         progress(1)
     one_place = task.path is None
-    values = np.where(known, seen, np.nan)
     band = Band("visible" if one_place else "places that see it", "", "uint8", float(UNKNOWN), "nearest")
     if not one_place:
         band = Band("places that see it", "", "float32")
@@ -90,7 +89,8 @@ def run(task: Task, progress: Callable[[int], object]) -> dict[str, Any]:
     def block(window: Window) -> npt.NDArray[Any]:
         top = surface.grid.row + surface.grid.rows - window.row - window.rows
         left = window.column - surface.grid.column
-        return values[top : top + window.rows, left : left + window.columns]
+        part = slice(top, top + window.rows), slice(left, left + window.columns)
+        return np.where(known[part], seen[part].astype(np.float32), np.float32(np.nan))
 
     with written_aside(task.output) as aside:
         geotiff.write(aside, surface.grid, surface.crs, band, block, corner_m=(surface.west_m, surface.north_m))
@@ -152,7 +152,7 @@ def _surface(task: Task, progress: Callable[[int], object]) -> Surface:
     if grid is None:
         raise CoverageError(f"{task.source}: all its points are classed as noise or as what moves, or are alone")
     _check_size(grid)
-    heights = filled(cells.window(grid, "max"), max(round(_GAP_M / cell_m), 1))
+    heights = filled_by_bands(lambda window: cells.window(window, "max"), grid, max(round(_GAP_M / cell_m), 1))
     told = (*alone(task.source, strays), *unstated(cloud))
     return Surface(heights, grid.west_m, grid.north_m, grid, crs, unit, told)
 

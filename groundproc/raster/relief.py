@@ -4,6 +4,7 @@ Functions of an array of heights, shape (rows, columns), the first row in the no
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -11,11 +12,15 @@ import numpy.typing as npt
 from numba import njit
 from scipy import ndimage
 
+from groundproc.raster.grid import Window
+
 Heights = npt.NDArray[np.float32]
 
 SUN_AZIMUTH_DEG: Final = 315.0
 SUN_ELEVATION_DEG: Final = 45.0
 SKY_DIRECTIONS: Final = 16
+BAND_ROWS: Final = 512
+"""Of a raster that is filled band after band."""
 
 
 def filled(height_m: Heights, cells: int) -> Heights:
@@ -32,6 +37,25 @@ def filled(height_m: Heights, cells: int) -> Heights:
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = total / weight + _base(height_m)
     return np.where(known, height_m, np.where(near & (weight > 1e-6), mean, np.nan)).astype(np.float32)
+
+
+def filled_by_bands(take: Callable[[Window], Heights], grid: Window, cells: int) -> Heights:
+    """`filled` of a large raster, band after band: a tenth of the memory.
+
+    Parameters
+    ----------
+    take : callable
+        Gives heights of a window, the first row in the north; NaN beyond the raster.
+    grid : Window
+    cells : int
+    """
+    margin = 2 * cells + 1  # the means reach four sigmas, half a gap each
+    out = np.empty((grid.rows, grid.columns), np.float32)
+    for top in range(0, grid.rows, BAND_ROWS):
+        count = min(BAND_ROWS, grid.rows - top)
+        band = Window(grid.column, grid.row + grid.rows - top - count, grid.columns, count)
+        out[top : top + count] = filled(take(band.grown(margin)), cells)[margin : margin + count, margin:-margin]
+    return out
 
 
 def hillshade(

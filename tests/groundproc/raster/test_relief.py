@@ -1,11 +1,13 @@
 """Hillshade, local relief and sky-view factor of surfaces for which they are known."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from groundproc.raster import relief
+from groundproc.raster.grid import Window
 
 
 def plane(east: float, north: float, size: int = 41, cell_m: float = 0.5) -> relief.Heights:
@@ -59,3 +61,25 @@ def test_the_floor_of_a_trench_sees_the_sky_between_its_walls() -> None:
     # the wall is met at whole cells: half a cell in 9, where the sine of the horizon changes most by some 3 %
     assert made == pytest.approx(expected, abs=0.02)
     assert relief.sky_view(plane(0.0, 0.0), cell_m, 5.0) == pytest.approx(1.0)
+
+
+def test_band_after_band_gaps_are_filled_as_in_the_whole() -> None:
+    rng = np.random.default_rng(3)
+    grid = Window(-7, 100, 90, 3 * relief.BAND_ROWS // 2)
+    height = (rng.normal(0, 1, (grid.rows, grid.columns)) + np.linspace(200, 260, grid.rows)[:, None]).astype(
+        np.float32
+    )
+    height[rng.random(height.shape) < 0.6] = np.nan
+    height[:, 40:60] = np.nan  # wider than what is filled
+    reach = 20  # of the raster that the bands are cut of: beyond it there is nothing
+    padded = np.pad(height, reach, constant_values=np.nan)
+
+    def take(window: Window) -> Any:
+        top = grid.row + grid.rows - window.row - window.rows + reach
+        left = window.column - grid.column + reach
+        return padded[top : top + window.rows, left : left + window.columns]
+
+    bands = relief.filled_by_bands(take, grid, 4)
+    whole = relief.filled(padded, 4)[reach:-reach, reach:-reach]
+    np.testing.assert_array_equal(np.isfinite(bands), np.isfinite(whole))
+    np.testing.assert_allclose(bands, whole, rtol=0, atol=1e-3)
