@@ -46,6 +46,8 @@ class SetAside:
                 self._whole += first + count <= self._seen
         except OSError:
             self._parts, self._whole = [], 0
+            if self._file is not None:
+                self._file.close()  # at once: the cloud needs the room
 
     def _write(self, records: Records) -> None:
         left = memoryview(records.view(np.uint8).data)

@@ -3,7 +3,7 @@
 Map
 ---
 system        what systems do differently: locks, processes, links, memory given back
-stopping      Ctrl-C and SIGTERM as exceptions
+stopping      Ctrl-C, SIGTERM and SIGXCPU as exceptions
 readahead     the next piece made by a thread while the last one is used
 screen        what a command writes to a terminal, made harmless
 loopback      pages for a browser on this machine alone

@@ -59,7 +59,7 @@ def heard() -> Iterator[None]:
     before = len(_told)
     try:
         yield
-    except Exception:
+    except Exception:  # broad: whatever a library makes of the exception; without a signal it is raised again
         if len(_told) > before:
             raise Stopped(_told[-1]) from None
         raise

@@ -40,7 +40,7 @@ def filled(height_m: Heights, cells: int) -> Heights:
 
 
 def filled_by_bands(take: Callable[[Window], Heights], grid: Window, cells: int) -> Heights:
-    """`filled` of a large raster, band after band: a tenth of the memory.
+    """`filled` of a large raster, band after band: beside the result, the memory of one band.
 
     Parameters
     ----------

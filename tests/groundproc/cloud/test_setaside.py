@@ -1,5 +1,6 @@
 """Parts of a cloud set aside as it is written: the same records as the file holds, and nothing is unpacked for them."""
 
+import io
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,24 @@ def test_a_full_disk_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     aside.see(records(100))
     aside.see(records(100))
     assert not aside.has([(0, 10)])
+
+
+def test_a_disk_that_fills_up_has_its_room_back_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cloud itself is written to it."""
+
+    class Filling(io.BytesIO):
+        def write(self, given: Any) -> int:
+            if self.tell() >= 50:
+                raise OSError(28, "No space left on device")
+            return super().write(bytes(given)[:50])
+
+    file = Filling()
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: file)
+    aside = SetAside(lambda: [(0, 100)])
+    aside.see(records(100))
+    assert file.closed
+    aside.see(records(100))
+    assert not aside.has([(0, 100)])
 
 
 def test_a_writer_sets_aside_what_its_file_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
