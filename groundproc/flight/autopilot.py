@@ -20,6 +20,7 @@ from flightlog.vehicles import Address, Sender, Vehicles
 from groundproc.flight.sharing import parted
 from groundproc.flight.sound import possible
 from groundproc.flight.sync import GyroTrack
+from groundproc.machine.aside import aside
 
 Array = npt.NDArray[np.float64]
 
@@ -268,7 +269,7 @@ def _boot(number: int, address: tuple[int, int], mine: Sequence[Frame], clock_ms
             table, rows = table[good], rows[good]
         stamp_ns = _stamps_ns(table, clock_ms[rows])
         keep = increasing(stamp_ns)
-        tables[name], stamps[name] = table[keep], stamp_ns[keep]
+        tables[name], stamps[name] = aside(table[keep], stamp_ns[keep])
     return Boot(number, *address, tables, stamps, left_out=left_out)
 
 

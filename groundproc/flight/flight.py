@@ -22,6 +22,7 @@ from groundproc.flight.positionpackets import PositionCollector, PositionSamples
 from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
 from groundproc.flight.vehicle import Choice
+from groundproc.machine.aside import aside
 from groundproc.sensors.model import Lidar
 
 Progress = Callable[[int], None]
@@ -188,13 +189,14 @@ def _batch_times(readers: Sequence[LogReader], lidar: Lidar) -> tuple[npt.NDArra
 
 
 def _imu(samples: PositionSamples, part: slice) -> tuple[GyroTrack, npt.NDArray[np.float64]] | tuple[None, None]:
-    """Rates and specific force of the samples that are later than all before them."""
+    """Rates and specific force of the samples that are later than all before them; of a long flight they are tens of megabytes."""
     time_ns = samples.device_time_ns[part]
     good = samples.has_imu[part].copy()
     good[1:] &= time_ns[1:] > np.maximum.accumulate(time_ns)[:-1]
     if good.sum() < 2 or np.ptp(samples.gyro_rad_s[part][good], axis=0).max() == 0.0:
         return None, None
-    return GyroTrack("the lidar", time_ns[good], samples.gyro_rad_s[part][good]), samples.accel_m_s2[part][good]
+    time_ns, rate, force = aside(time_ns[good], samples.gyro_rad_s[part][good], samples.accel_m_s2[part][good])
+    return GyroTrack("the lidar", time_ns, rate), force
 
 
 def _fixes(samples: PositionSamples, part: slice) -> tuple[tuple[int, nmea.Rmc], ...]:

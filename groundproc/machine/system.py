@@ -5,9 +5,11 @@ import ctypes
 import errno
 import importlib
 import importlib.util
+import mmap
 import os
 import shutil
 import sys
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -18,9 +20,13 @@ LIMITED: Final = os.name == "posix" and importlib.util.find_spec("resource") is 
 """Whether a process can be started that has limits and shares memory by a descriptor."""
 _PUNCH_HOLE_KEEP_SIZE: Final = 3
 """Of Linux' fallocate."""
+_mapped: "Final[weakref.WeakSet[mmap.mmap]]" = weakref.WeakSet()
+_M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
 """Of glibc's mallopt."""
 _LARGE_BLOCK: Final = 4 << 20
+_FREE_OF_HEAP: Final = 8 << 20, 64 << 20
+"""What glibc keeps free at the end of each thread's heap: while large blocks go back, and what it has come to by itself otherwise."""
 _LARGEST_OF_HEAP: Final = 32 << 20
 """What glibc takes from its heap at most, on 64 bits."""
 _QUERY: Final = 0x1000
@@ -42,28 +48,48 @@ def without(*names: str) -> Iterator[None]:
 
 
 def give_back_memory() -> None:
-    """Give what is free to the system, where the C library keeps it: it takes glibc 10 ms, and is 100 MB and more after many threads."""
+    """Give what is free to the system, where the C library keeps it: it takes glibc 10 ms, and is 100 MB and more after many threads.
+
+    With it what of files is in memory that are mapped to be read now and then.
+    """
+    let_go()
     with contextlib.suppress(OSError, AttributeError, TypeError):  # other C libraries, and none by that way
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def read_now_and_then(room: mmap.mmap) -> mmap.mmap:
+    """A file mapped into memory as one of which `let_go` leaves nothing there until it is read again."""
+    _mapped.add(room)
+    return room
+
+
+def let_go() -> None:
+    """Have nothing of such files in memory, where the system can do so."""
+    if hasattr(mmap, "MADV_DONTNEED"):
+        for room in list(_mapped):
+            room.madvise(mmap.MADV_DONTNEED)
 
 
 @contextlib.contextmanager
 def large_blocks_given_back() -> Iterator[None]:
     """Have what is large go back to the system when it is freed, where the C library is glibc.
 
-    By itself glibc takes blocks up to 32 MB from its heap as soon as one of that size was freed, and the heap keeps the holes. Afterwards
-    they are, for fresh memory takes as long to come as to fill: that is for who works on millions of rows, and not for who streams.
+    By itself glibc takes blocks up to 32 MB from its heap as soon as one of that size was freed, and the heap keeps the holes, and twice as
+    much at its end, of each thread. Afterwards they are, for fresh memory takes as long to come as to fill: that is for who works on
+    millions of rows, and not for who streams.
     """
-    _set_least_apart(_LARGE_BLOCK)
+    _set_heap(_LARGE_BLOCK, _FREE_OF_HEAP[0])
     try:
         yield
     finally:
-        _set_least_apart(_LARGEST_OF_HEAP)
+        _set_heap(_LARGEST_OF_HEAP, _FREE_OF_HEAP[1])
 
 
-def _set_least_apart(size: int) -> None:
+def _set_heap(least_apart: int, most_free: int) -> None:
     with contextlib.suppress(OSError, AttributeError, TypeError):  # as above
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, size)
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, least_apart)
+        library.mallopt(_M_TRIM_THRESHOLD, most_free)
 
 
 def give_back_disk(file: int, begin: int, size: int) -> None:

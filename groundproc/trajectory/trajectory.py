@@ -17,6 +17,7 @@ from numba import njit
 from flightlog.clock import utc_text
 from flightlog.errors import CoverageError
 from groundproc.geodesy import LocalFrame
+from groundproc.machine.aside import aside
 from groundproc.numerics.layout import to_read
 from groundproc.numerics.rotations import quat_difference, quat_turned
 from groundproc.trajectory.covariance import Correlation, chained, scaled, uncorrelated
@@ -97,6 +98,10 @@ class Trajectory:
         if correlation is not None and len(time_ns):
             correlation = correlation.between(int(time_ns[0]), int(time_ns[-1]))
         return replace(self, **arrays | {"covered": covered}, correlation=correlation)
+
+    def set_aside(self) -> "Trajectory":
+        """The same with its knots in a file, of which is in memory what is read."""
+        return replace(self, **dict(zip(_ARRAYS, aside(*(getattr(self, name) for name in _ARRAYS)), strict=True)))
 
     def before(self, time_ns: int) -> "Trajectory":
         """The knots up to a time [ns]."""

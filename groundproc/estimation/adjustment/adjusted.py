@@ -47,7 +47,7 @@ from groundproc.estimation.odometry.stated import Recorded
 from groundproc.estimation.odometry.track import Track
 from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.flight.timeline import Leg
-from groundproc.machine.system import give_back_memory
+from groundproc.machine.system import give_back_memory, large_blocks_given_back
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.trajectory.estimate import Estimate
 from groundproc.trajectory.trajectory import Trajectory, joined
@@ -85,7 +85,8 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
             "a surface again at once"
         )
     begun = begun_from(given, progress)
-    start = begun.trajectory
+    start, begun_sigma_source = begun.trajectory.set_aside(), begun.sigma_source
+    del begun
     made: list[Run | CausalRun] = []
     numbers: list[int] = []
     reasons: list[LogError] = []
@@ -116,7 +117,7 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
     return Estimate(
         trajectory,
         mount,
-        begun.sigma_source if main.is_worse() else main.SIGMA_SOURCE,
+        begun_sigma_source if main.is_worse() else main.SIGMA_SOURCE,
         main.lasers(given.corrections, len(given.lidar.lasers)),
         mount_source=main.mount_source(given.mount_source),
         mount_sigma=main.mount_sigma(given.mount),
@@ -200,6 +201,9 @@ def adjust_run(
     `exact` names globals whose covariance is wanted exactly; `more` are observations of neither the log nor the survey.
     """
     motion, own, other = base_motion(given, max(legs, key=lambda leg: leg.sync.samples), given.flight.runs[number])
+    # of all of the flight only what a window or a slice asks for is in memory
+    motion = motion.set_aside()
+    own, other = (None if unit is None else unit.set_aside() for unit in (own, other))
     units = {name: unit for name, unit in (("lidar", own), ("ins", other)) if unit is not None}
     mat, lever = given.mount.mat_ins_lidar(), given.mount.lidar_position_m()
     observations = [*observations_of(Flown(given, legs, units)), *more]
@@ -233,6 +237,8 @@ def adjust_run(
             pace.caught_up()
             begin = last - OVERLAP
             windows[-1].own = begin - windows[-1].first
+            windows[-1].set_aside()
+            give_back_memory()
     track = tracked(tracker)
     _redo(tracker, motion, early)
     tracker.odometry = None  # and its map
@@ -265,6 +271,7 @@ def _redo(tracker: Tracker, motion: Motion, early: list[Slice]) -> None:
     early.clear()
 
 
+@large_blocks_given_back()
 def joined_run(windows: list[Window], track: Track, motion: Motion, sources: Sources) -> Run:
     """The windows as one run: more than one are adjusted together."""
     run = Run(windows, joined_path(windows), track, motion, sources)

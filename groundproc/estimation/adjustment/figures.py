@@ -44,7 +44,7 @@ def odometry_figures(track: Track, motion: Motion, path: Path | None, trajectory
     moved, turned = np.zeros((0, 3)), np.zeros((0, 3))
     if path is not None:
         quat, position_m = path.quat[::STEPS], path.position_m[::STEPS]
-        moved, turned = changed(np.array(track.quat), np.array(track.position_m), quat, position_m)
+        moved, turned = changed(track.quat[:], track.position_m[:], quat, position_m)
     return {
         "adjustment.begin_ns": np.array(begin_ns),
         "adjustment.slice_s": np.asarray((knots_ns[1:] - begin_ns) * 1e-9),

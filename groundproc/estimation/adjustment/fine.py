@@ -53,6 +53,8 @@ SURE_RAD: Final = np.deg2rad(0.002)
 """How closely a part of the flight goes on where the one before ended."""
 BACK_S: Final = 0.1
 """Within so long the path's knots bring errors back."""
+_KEPT: Final = np.dtype([("time_ns", "<i8"), ("xyz", "<f4", (3,)), ("count", "<i4")])
+"""Of a slice's clusters: numpy's choice of fields keeps the room of the others."""
 
 
 def refined(path: Path, pieces: Iterable[Slice], grid_ns: int, density: float, voxel_m: float) -> Path:
@@ -85,7 +87,7 @@ def refined(path: Path, pieces: Iterable[Slice], grid_ns: int, density: float, v
                 first = at
             last = at + STEPS + 1
             planes.insert(world, found, Odometry.MOST, judged=False)
-            clusters.append(found[["time_ns", "xyz", "count"]].copy())
+            clusters.append(found[list(_KEPT.names or ())].astype(_KEPT))
     if clusters:
         _turn(path, slice(first, last), turns, clusters, planes, density)
     return replace(path, quat=frames.quat_multiply(path.quat, frames.quat_exp(turns)))

@@ -33,7 +33,9 @@ from groundproc.estimation.observations.planes import Rows, places, rows_of
 from groundproc.estimation.observations.rows import Factor, H, RowBuilder, Unknowns, cross, eye, whitened
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
+from groundproc.machine.system import give_back_memory
 from groundproc.numerics.splines import basis
+from groundproc.numerics.voxelhash import assign
 from groundproc.trajectory.covariance import SIZE, Correlation
 
 Array = npt.NDArray[np.float64]
@@ -143,7 +145,9 @@ class Joining:
     def run(self) -> "Joined":
         """All steps, and the posterior of the last."""
         for voxel_m, cut in ROUNDS:
+            last = None  # rows are large: those of the step before go before new ones are made
             last = self.step(voxel_m, cut)
+        assert last is not None
         last = self._hold(last)
         self.log[-1] |= last.figures()
         return self._joined(last.unknowns, last.spread(DRAWS), last.datum())
@@ -171,6 +175,7 @@ class Joining:
 
     def step(self, voxel_m: float, cut: bool) -> Posterior:
         """One Gauss-Newton step."""
+        give_back_memory()
         unknowns = self.unknowns()
         seen = self.patches.of(shared(self.patches, self.path, voxel_m))
         rows = rows_of(seen.clusters, self.path, voxel_m, ROWS, cut)
@@ -307,9 +312,7 @@ def padded(path: Path) -> Path:
 def shared(patches: Patches, path: Path, voxel_m: float) -> npt.NDArray[np.bool_]:
     """Which patches lie in a voxel that more than one window saw: of the others the windows have said all there is."""
     world = places(patches.clusters, path)
-    keys = np.ascontiguousarray(np.floor(world / voxel_m).astype(np.int32))
-    _, voxel = np.unique(keys.view([("", np.int32)] * 3).ravel(), return_inverse=True)
-    voxels = int(voxel.max()) + 1 if len(voxel) else 0
+    voxel, voxels = assign(world, voxel_m)
     low, high = np.full(voxels, np.iinfo(np.int32).max, np.int32), np.full(voxels, -1, np.int32)
     np.minimum.at(low, voxel, patches.window)
     np.maximum.at(high, voxel, patches.window)

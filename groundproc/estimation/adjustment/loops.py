@@ -98,7 +98,7 @@ class _Pieces:
         self._made: dict[int, Surfaces] = {}
         step_m = np.linalg.norm(np.diff(path.position_m[::STEPS], axis=0), axis=1)
         self._way_m = np.append(0.0, np.cumsum(step_m))[::PIECE]
-        sigma = np.array(track.sigma[first:last])
+        sigma = track.sigma[first:last]
         self._sigma = np.column_stack([sigma[:, 3:6], sigma[:, :3].max(axis=1)])[PIECE // 2 :: PIECE]
 
     def surfaces(self, number: int) -> Surfaces:

@@ -14,6 +14,7 @@ from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import even_shares
+from groundproc.machine.aside import aside
 from groundproc.numerics.planes import Placed, add_scatter, flattest_of
 from groundproc.numerics.voxelhash import assign, sorted_by, spread, voxel_key
 
@@ -56,6 +57,12 @@ class Patches:
 
     def __len__(self) -> int:
         return len(self.draw)
+
+    def set_aside(self) -> None:
+        """Have all of them in a file until they are read."""
+        c = self.clusters
+        *columns, self.draw, self.window = aside(c.time_ns, c.xyz_m, c.scatter_m2, c.count, self.draw, self.window)
+        self.clusters = Clusters(*columns)
 
     def of(self, which: npt.NDArray[Any]) -> "Patches":
         """Some of them, by a mask or numbers."""

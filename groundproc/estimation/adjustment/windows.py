@@ -5,7 +5,7 @@ The errors that are then left between windows are for `joining`.
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -33,6 +33,7 @@ from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import LIDAR, Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
+from groundproc.machine.aside import aside
 from groundproc.machine.system import give_back_memory, large_blocks_given_back
 from groundproc.trajectory.covariance import SIZE
 
@@ -144,6 +145,13 @@ class Window:
     loops: list[dict[str, float]] = field(default_factory=list)
     beside: int = 0
 
+    def set_aside(self) -> None:
+        """Have what grows with the flight in a file until the windows are joined."""
+        quat, position_m, self.correlation = aside(self.path.quat, self.path.position_m, self.correlation)
+        self.path = replace(self.path, quat=quat, position_m=position_m)
+        if self.seen is not None:
+            self.seen.patches.set_aside()
+
 
 @dataclass(slots=True)
 class Seen:
@@ -182,7 +190,7 @@ def adjust_window(
     loops = closed_loops(path, track, first, last)
     path = loops.path
     mat, lever = sources.mat_ins_lidar, sources.lever_m
-    bias = np.array(track.gyro_bias[first:last]).mean(axis=0)
+    bias = track.gyro_bias[first:last].mean(axis=0)
     unheld_m = np.array(track.unheld_m[first:last])
     stretch = Stretch(
         path, motion.source, bias, not before and not more,
@@ -191,6 +199,7 @@ def adjust_window(
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart), retiming=retiming_of(observations, motion.source))
     track.forget(last - OVERLAP if more else last)
+    give_back_memory()
     lidar.doubted = along_untold(track)[first:last]
     if motion.source == LIDAR:
         lidar.spin = spin_of(lidar.clusters, path)

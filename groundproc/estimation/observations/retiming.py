@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from flightlog import frames
 from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
-from groundproc.estimation.odometry.motion import ImuTrack, on_grid
+from groundproc.estimation.odometry.motion import ImuTrack, near, on_grid
 from groundproc.estimation.odometry.spline import Path
 
 Array = npt.NDArray[np.float64]
@@ -74,8 +74,14 @@ class Retiming:
     def retimed(self, path: Path, part: Mapping[str, Array]) -> Path:
         """A path whose motion between two knots is that of the gyro, as late as a solution has it that is not yet taken; knots stay."""
         steps = path.intervals * STEPS
+        some = near(self.track.time_ns, path.start_ns, steps)
         (before, known), (after, still) = (
-            on_grid(self.track.time_ns - round(float(late_s[0]) * 1e9), self.track.rate_rad_s, path.start_ns, steps)
+            on_grid(
+                self.track.time_ns[some] - round(float(late_s[0]) * 1e9),
+                self.track.rate_rad_s[some],
+                path.start_ns,
+                steps,
+            )
             for late_s in (self.delay_s, self.delay_s + part[self.name])
         )
         # over so short a time turns add up as vectors: the mean rate of what is shifted lies along the rate

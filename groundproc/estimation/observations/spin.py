@@ -41,6 +41,8 @@ RATES_HZ: Final = np.arange(4.0, 26.0, 0.125)
 """Spins that are sought; lidars of this kind are specified for 5 to 20 Hz."""
 SOUGHT: Final = 20
 """Slices on end that the spin is sought in."""
+AT_ONCE: Final = 1 << 17
+"""Clusters that are looked at together: a window has millions."""
 CLEAR: Final = 0.9
 """Coherence of azimuth and time below which nothing spins evenly."""
 
@@ -182,16 +184,22 @@ def spin_of(clusters: Clusters, path: Path) -> Spin | None:
     """The rotor of a lidar all of whose lasers look along one azimuth; None where nothing turns evenly."""
     if not len(clusters):
         return None
-    since_s = np.asarray((clusters.time_ns - path.start_ns) * 1e-9, np.float64)
-    azimuth = np.arctan2(*clusters.xyz_m[:, :2].astype(np.float64).T)
-    slot = np.clip((clusters.time_ns - path.start_ns) // (STEPS * path.step_ns), 0, path.intervals - 1)
-    rate = _sought(since_s, azimuth, slot)
+    slot = np.empty(len(clusters), np.int32)
+    parts = [slice(begin, begin + AT_ONCE) for begin in range(0, len(clusters), AT_ONCE)]
+    count = np.zeros(path.intervals)
+    for part in parts:
+        slot[part] = np.clip((clusters.time_ns[part] - path.start_ns) // (STEPS * path.step_ns), 0, path.intervals - 1)
+        count += np.bincount(slot[part], minlength=path.intervals)
+    first = int(count.argmax())
+    rate = _sought(*_turning(clusters, path, np.flatnonzero((slot >= first) & (slot < first + SOUGHT))))
     if rate is None:
         return None
-    off = azimuth - rate * since_s
-    east, north, count = (
-        np.bincount(slot, each, path.intervals) for each in (np.sin(off), np.cos(off), np.ones(len(off)))
-    )
+    east, north = np.zeros((2, path.intervals))
+    for part in parts:
+        since_s, azimuth = _turning(clusters, path, part)
+        off = azimuth - rate * since_s
+        east += np.bincount(slot[part], np.sin(off), path.intervals)
+        north += np.bincount(slot[part], np.cos(off), path.intervals)
     seen = np.flatnonzero(count)
     if np.hypot(east, north)[seen].sum() < CLEAR * count.sum():
         return None
@@ -217,12 +225,17 @@ def _demodulated(rate: Array, known: Flags, azimuth: Array) -> tuple[Array, Arra
     return np.stack([-line.imag, line.real]), np.sqrt(np.mean(np.abs(noise) ** 2, axis=0) / 2.0)
 
 
-def _sought(since_s: Array, azimuth: Array, slot: Ints) -> float | None:
+def _turning(clusters: Clusters, path: Path, which: Any) -> tuple[Array, Array]:
+    """Times of some clusters since a path's begin [s], and their azimuths [rad], shape (n,) each."""
+    since_s = (clusters.time_ns[which] - path.start_ns) * 1e-9
+    return since_s, np.arctan2(*clusters.xyz_m[which, :2].astype(np.float64).T)
+
+
+def _sought(since_s: Array, azimuth: Array) -> float | None:
     """Rate of the rotor [rad/s] in some slices on end: that by which azimuths and times go together best."""
-    first = int(np.bincount(slot).argmax())
-    some = np.flatnonzero((slot >= first) & (slot < first + SOUGHT))
-    some = some[:: max(len(some) // 4000, 1)]
+    every = max(len(since_s) // 4000, 1)
+    since_s, azimuth = since_s[::every], azimuth[::every]
     rates = 2.0 * np.pi * RATES_HZ
-    together = np.abs(np.exp(1j * (azimuth[some] - rates[:, None] * since_s[some])).sum(axis=1))
+    together = np.abs(np.exp(1j * (azimuth - rates[:, None] * since_s)).sum(axis=1))
     best = int(together.argmax())
-    return float(rates[best]) if together[best] > 0.5 * len(some) else None
+    return float(rates[best]) if together[best] > 0.5 * len(since_s) else None

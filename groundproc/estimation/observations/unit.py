@@ -10,7 +10,7 @@ from flightlog import frames
 from flightlog.errors import CoverageError
 from groundproc.estimation.observations.rows import H
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
-from groundproc.estimation.odometry.motion import ImuTrack, on_grid
+from groundproc.estimation.odometry.motion import ImuTrack, near, on_grid
 from groundproc.estimation.odometry.spline import Path
 from groundproc.numerics import robust
 
@@ -82,18 +82,20 @@ def place_on_grid(unit: Unit, track: ImuTrack, path: Path) -> None:
         With them its samples would not follow each other.
     """
     steps = path.intervals * STEPS
-    since_middle_ns = track.time_ns - (path.start_ns + steps * STEP_NS // 2)
+    some = near(track.time_ns, path.start_ns, steps)
+    stamps_ns, rate, force = track.time_ns[some], track.rate_rad_s[some], track.force_m_s2[some]
+    since_middle_ns = stamps_ns - (path.start_ns + steps * STEP_NS // 2)
     late_ns = 1e9 * float(unit.values["delay"][0]) + float(unit.values["drift"][0]) * since_middle_ns
-    time_ns = track.time_ns - np.rint(late_ns).astype(np.int64)
+    time_ns = stamps_ns - np.rint(late_ns).astype(np.int64)
     if not (np.diff(time_ns) > 0).all():
         drift = float(unit.values["drift"][0])
         raise CoverageError(
             f"{unit.name}: a drift of its clock by {drift:.2g} s in a second came out of the adjustment, which cannot be; is the flight "
             "long enough, and do positions and poses given beside it belong to it?"
         )
-    unit.rate_rad_s, unit.known = on_grid(time_ns, track.rate_rad_s, path.start_ns, steps)
-    unit.force_m_s2, unit.force_known = on_grid(time_ns, np.nan_to_num(track.force_m_s2), path.start_ns, steps)
-    if not np.isfinite(track.force_m_s2).all():
+    unit.rate_rad_s, unit.known = on_grid(time_ns, rate, path.start_ns, steps)
+    unit.force_m_s2, unit.force_known = on_grid(time_ns, np.nan_to_num(force), path.start_ns, steps)
+    if not np.isfinite(force).all():
         unit.force_known[:] = False
 
 

@@ -64,7 +64,7 @@ def redo_beginning(
     )  # fmt: skip
     state = before.state
     begin = State(
-        track.quat[count].copy(), track.position_m[count].copy(), -track.velocity_m_s[count - 1],
+        track.quat[count], track.position_m[count], -track.velocity_m_s[count - 1],
         -track.gyro_bias[count - 1], state.accel_bias_m_s2.copy(), state.gravity_m_s2.copy(), np.diag(SIGMA**2),
     )  # fmt: skip
     line = None if before.line is None else before.line.reversed()

@@ -5,7 +5,7 @@ clock that stamps the returns. The autopilot's comes at 10 to 400 Hz through MAV
 another clock.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from groundproc.estimation.method import Given
 from groundproc.estimation.odometry.grid import STEP_NS
 from groundproc.flight.autopilot import Boot
 from groundproc.flight.timeline import Leg, LidarRun
+from groundproc.machine.aside import aside
 from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
@@ -53,6 +54,11 @@ class ImuTrack:
     force_m_s2: Array
     sigma_rate_rad_s: float
     sigma_force_m_s2: float
+
+    def set_aside(self) -> "ImuTrack":
+        """The same in a file, of which is in memory what is read."""
+        time_ns, rate, force = aside(self.time_ns, self.rate_rad_s, self.force_m_s2)
+        return replace(self, time_ns=time_ns, rate_rad_s=rate, force_m_s2=force)
 
     @property
     def rate_hz(self) -> float:
@@ -205,9 +211,24 @@ class Motion:
     def __len__(self) -> int:
         return len(self.rate_rad_s)
 
+    def set_aside(self) -> "Motion":
+        """The same in a file, of which is in memory what is read."""
+        rate, force, known = aside(self.rate_rad_s, self.force_m_s2, self.known)
+        return replace(self, rate_rad_s=rate, force_m_s2=force, known=known)
+
 
 LONGEST_SAMPLE_GAP_NS: Final = 150_000_000
 CUBIC_BELOW_HZ: Final = 120.0
+BESIDE_NS: Final = 3 * NS_PER_S
+BESIDE: Final = 8
+"""So long, and so many samples, before and after some steps are enough for `on_grid`: a cubic forgets by a factor of four with each."""
+
+
+def near(time_ns: Times, start_ns: int, steps: int) -> slice:
+    """The samples of a whole flight that some of its grid steps need."""
+    ends = np.array([start_ns - BESIDE_NS, start_ns + steps * STEP_NS + BESIDE_NS])
+    first, last = np.searchsorted(time_ns, ends).tolist()
+    return slice(max(first - BESIDE, 0), last + BESIDE)
 
 
 def on_grid(time_ns: Times, values: Array, start_ns: int, steps: int) -> tuple[Array, npt.NDArray[np.bool_]]:

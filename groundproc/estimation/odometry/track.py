@@ -1,5 +1,6 @@
 """What the forward pass of the odometry found, slice after slice, with what the batch needs of each."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -11,6 +12,7 @@ from numba import njit
 from flightlog import frames
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import SLICE_NS, STEP_NS, STEPS
+from groundproc.estimation.odometry.growing import Growing
 from groundproc.estimation.odometry.motion import Motion, MotionGrid
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE
 from groundproc.estimation.odometry.spline import Path, integrated, smooth_path
@@ -37,10 +39,12 @@ class Track:
     ----------
     first : int
         Number of the first slice.
-    quat, position_m : list of ndarray
+    quat, position_m : Growing
         Poses of the sensor at the slice boundaries, one more than there are slices.
-    gyro_bias : list of ndarray
+    velocity_m_s, gyro_bias : Growing
         At the end of each slice.
+    sigma : Growing
+        Of attitude [rad] and position [m] there.
     clusters : list of ndarray of CLUSTER_DTYPE
         Of each slice; empty where the lidar was silent.
     matched, seen : list of int
@@ -65,11 +69,11 @@ class Track:
     """
 
     first: int
-    quat: list[Array]
-    position_m: list[Array]
-    velocity_m_s: list[Array] = field(default_factory=list)
-    gyro_bias: list[Array] = field(default_factory=list)
-    sigma: list[Array] = field(default_factory=list)
+    quat: Growing = field(default_factory=functools.partial(Growing, 4))
+    position_m: Growing = field(default_factory=functools.partial(Growing, 3))
+    velocity_m_s: Growing = field(default_factory=functools.partial(Growing, 3))
+    gyro_bias: Growing = field(default_factory=functools.partial(Growing, 3))
+    sigma: Growing = field(default_factory=functools.partial(Growing, 6))
     clusters: list[npt.NDArray[np.void]] = field(default_factory=list)
     matched: list[int] = field(default_factory=list)
     seen: list[int] = field(default_factory=list)
@@ -91,20 +95,18 @@ class Track:
     def path(self, motion: Motion, start: int, end: int) -> Path:
         """Smooth path over slices `start` to `end`, counted from the first."""
         grid = slice((self.first + start) * STEPS, (self.first + end) * STEPS)
-        bias = np.repeat(np.array(self.gyro_bias[start:end]), STEPS, axis=0)
+        bias = np.repeat(self.gyro_bias[start:end], STEPS, axis=0)
         rate = motion.rate_rad_s[grid] - bias.mean(axis=0)
         start_ns = motion.start_ns + (self.first + start) * SLICE_NS
-        return smooth_path(
-            start_ns, rate, np.array(self.quat[start : end + 1]), np.array(self.position_m[start : end + 1])
-        )
+        return smooth_path(start_ns, rate, self.quat[start : end + 1], self.position_m[start : end + 1])
 
     def causal_path(self, motion: MotionGrid, start: int = 0, end: int | None = None) -> Path:
         """The path over slices `start` to `end` as known at the end of each slice: nothing of what came later is in it."""
         end = len(self) if end is None else end
         count = end - start
         grid = slice((self.first + start) * STEPS, (self.first + end) * STEPS)
-        rate = motion.rate_rad_s[grid] - np.repeat(np.array(self.gyro_bias[start:end]), STEPS, axis=0)
-        quats, places = np.array(self.quat[start : end + 1]), np.array(self.position_m[start : end + 1])
+        rate = motion.rate_rad_s[grid] - np.repeat(self.gyro_bias[start:end], STEPS, axis=0)
+        quats, places = self.quat[start : end + 1], self.position_m[start : end + 1]
         speeds = np.array([self.velocity_m_s[max(start - 1, 0)], *self.velocity_m_s[start:end]])
         share = (np.arange(STEPS) / STEPS)[:, None]
         step_s = SLICE_NS * 1e-9

@@ -9,6 +9,7 @@ from flightlog import frames
 from flightlog.errors import LogError
 from groundproc.estimation.odometry.bearing import Bearing
 from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
+from groundproc.estimation.odometry.growing import Growing
 from groundproc.estimation.odometry.history import History
 from groundproc.estimation.odometry.matching import TELLS_M
 from groundproc.estimation.odometry.motion import MotionGrid
@@ -128,7 +129,7 @@ class Tracker:
 
     def gyro_bias(self) -> Array:
         """The bias as known by now [rad/s], shape (3,)."""
-        return self._bias if self.track is None or not self.track.gyro_bias else self.track.gyro_bias[-1]
+        return self._bias if self.track is None or not len(self.track.gyro_bias) else self.track.gyro_bias[-1]
 
     def forget(self, slices: int) -> None:
         """The grid of motion begins that many slices later: the numbers of slices count from there."""
@@ -146,7 +147,7 @@ class Tracker:
         line = Line() if self._in_time else None
         # who is told each pose as it comes would only wait for what is done beside
         self.odometry = Odometry(state, self.motion, piece.number, voxel_m, line, beside=not self._in_time)
-        self.track = Track(piece.number, [state.quat.copy()], [state.position_m.copy()], voxel_m=voxel_m)
+        self.track = Track(piece.number, Growing(4, [state.quat]), Growing(3, [state.position_m]), voxel_m=voxel_m)
         self._set_out(state, piece.number)
         return True
 
@@ -170,15 +171,16 @@ class Tracker:
     def _note(self, odometry: Odometry, step: Step | None) -> None:
         track, state = self.track, odometry.state
         assert track is not None
-        track.quat.append(state.quat.copy())
-        track.position_m.append(state.position_m.copy())
-        track.velocity_m_s.append(state.velocity_m_s.copy())
-        track.gyro_bias.append(state.gyro_bias_rad_s.copy())
+        track.quat.append(state.quat)
+        track.position_m.append(state.position_m)
+        track.velocity_m_s.append(state.velocity_m_s)
+        track.gyro_bias.append(state.gyro_bias_rad_s)
         track.sigma.append(np.hypot(np.sqrt(np.diag(state.covariance)[:6]), self._rejoining.sigma()))
         track.matched.append(0 if step is None else step.matched)
         track.seen.append(0 if step is None else step.seen)
         track.residual_m.append(float("nan") if step is None else step.residual_m)
-        track.quats.append(None if step is None else step.quats)
+        # where turns are not found nobody asks for these, and a batch would keep them for the whole flight
+        track.quats.append(None if step is None or not odometry.turns else step.quats)
         track.unheld_m.append(float("inf") if step is None else step.unheld_m)
         track.next_unheld_m.append(float("inf") if step is None else step.next_unheld_m)
         if step is None or not self.keep:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from flightlog import frames
 from groundproc.estimation.adjustment.loops import closed_loops
 from groundproc.estimation.odometry.grid import STEP_NS, STEPS
+from groundproc.estimation.odometry.growing import Growing
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
@@ -107,9 +108,9 @@ def flown(walls: list[tuple[Array, Array, float]], route: Route, slices: int, dr
     way = place[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     off = Path(START_NS, frames.quat_multiply(turn, true.quat), way + share[:, None] * DRIFT_M)
     loose = (np.arange(slices) >= FROM) & (np.arange(slices) < UNTIL)
-    track = Track(0, [], [], clusters=clusters, unheld_m=np.where(loose, 0.2, 0.005).tolist())
+    track = Track(0, clusters=clusters, unheld_m=np.where(loose, 0.2, 0.005).tolist())
     sigma = np.concatenate([np.full(3, np.deg2rad(0.4)), np.full(3, 0.8)])
-    track.sigma = [sigma * min(max(k - FROM, 1) / (UNTIL - FROM), 1.0) for k in range(slices)]
+    track.sigma = Growing(6, [sigma * min(max(k - FROM, 1) / (UNTIL - FROM), 1.0) for k in range(slices)])
     return off, track, true
 
 

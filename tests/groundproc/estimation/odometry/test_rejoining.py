@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flightlog import frames
+from groundproc.estimation.odometry.growing import Growing
 from groundproc.estimation.odometry.rejoining import LOOSE, WORTH, Rejoining, turned_scatter
 from groundproc.estimation.odometry.slices import CLUSTER_DTYPE
 from groundproc.estimation.odometry.state import POSITION, STATES, State
@@ -72,7 +73,7 @@ def flown() -> Any:
     odometry: Any = filter_
     filled(odometry.planes, yard(1))
     watch, start = Rejoining(in_time=False), np.array([1.0, 0.0, 0.0, 0.0])
-    track = Track(0, [start], [np.zeros(3)])
+    track = Track(0, Growing(4, [start]), Growing(3, [np.zeros(3)]))
     for _ in range(WORTH + 10):
         noted(track, np.zeros(3))
         watch.note(odometry, 500, 0.01)
