@@ -101,7 +101,9 @@ class Trajectory:
 
     def set_aside(self) -> "Trajectory":
         """The same with its knots in a file, of which is in memory what is read."""
-        return replace(self, **dict(zip(_ARRAYS, aside(*(getattr(self, name) for name in _ARRAYS)), strict=True)))
+        kept = aside(*(getattr(self, name) for name in _ARRAYS))
+        arrays: dict[str, Any] = dict(zip(_ARRAYS, kept, strict=True))
+        return replace(self, **arrays)
 
     def before(self, time_ns: int) -> "Trajectory":
         """The knots up to a time [ns]."""

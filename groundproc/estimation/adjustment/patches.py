@@ -61,8 +61,10 @@ class Patches:
     def set_aside(self) -> None:
         """Have all of them in a file until they are read."""
         c = self.clusters
-        *columns, self.draw, self.window = aside(c.time_ns, c.xyz_m, c.scatter_m2, c.count, self.draw, self.window)
-        self.clusters = Clusters(*columns)
+        time_ns, xyz_m, scatter_m2, count, self.draw, self.window = aside(
+            c.time_ns, c.xyz_m, c.scatter_m2, c.count, self.draw, self.window
+        )
+        self.clusters = Clusters(time_ns, xyz_m, scatter_m2, count)
 
     def of(self, which: npt.NDArray[Any]) -> "Patches":
         """Some of them, by a mask or numbers."""
