@@ -47,6 +47,7 @@ from groundproc.estimation.odometry.stated import Recorded
 from groundproc.estimation.odometry.track import Track
 from groundproc.estimation.odometry.tracker import Tracker, tracked
 from groundproc.flight.timeline import Leg
+from groundproc.machine.aside import aside
 from groundproc.machine.system import give_back_memory, large_blocks_given_back
 from groundproc.sensors.lasers import ESTIMATE
 from groundproc.trajectory.estimate import Estimate
@@ -224,8 +225,9 @@ def adjust_run(
             continue
         if len(tracker.track) <= BEGINNING:
             early.append(piece)
-        if len(tracker.track) >= BEGINNING + AFTER and tracker.odometry is not None:
+        if len(tracker.track) >= BEGINNING + AFTER and tracker.odometry is not None and tracker.odometry.turns:
             tracker.odometry.turns = False  # only the map that the beginning is run again on goes by them
+            early = _aside(early)
         if len(tracker.track) - begin >= WINDOW:
             tracker.settle()
             _redo(tracker, motion, early)
@@ -262,6 +264,12 @@ def firm(guide: Trajectory) -> Trajectory:
     """What of a smoother's trajectory can tell that an odometry is wrong: in an outage of the GNSS it has metres a second of its own."""
     sigma = guide.sigma_position_m.max(axis=1)
     return replace(guide, covered=guide.covered & (sigma <= FIRM * np.nanmedian(sigma)))
+
+
+def _aside(pieces: Sequence[Slice]) -> list[Slice]:
+    """The same slices in a file: the beginning's are a hundred megabytes and more."""
+    kept = iter(aside(*(array for piece in pieces for array in (piece.time_ns, piece.xyz_m))))
+    return [replace(piece, time_ns=next(kept), xyz_m=next(kept)) for piece in pieces]
 
 
 def _redo(tracker: Tracker, motion: Motion, early: list[Slice]) -> None:

@@ -101,7 +101,6 @@ class Batch:
 
     def state(self, learn: bool = False) -> State:
         """What the observations share."""
-        self.lidar.clusters.take_back()
         spin = None if self.lidar.spin is None else self.lidar.spin.at_knots()
         return State(self.path, self.lidar.clusters, self.mat_sensor_ins, learn, spin)
 
@@ -127,7 +126,6 @@ class Batch:
             lambda: self.lidar.rows(self.path, voxel_m, cut),
             lambda: linearised((self.lidar, *self.observations), state, unknowns),
         )
-        self.lidar.clusters.put_aside()
         give_back_memory()
         linear = problem(rows, factors, unknowns, DEFLATION, self.path)
         x, steps = linear.solve(-linear.gradient, share=0.0 if cut else ROUGH)

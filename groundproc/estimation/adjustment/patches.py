@@ -15,6 +15,7 @@ from groundproc.estimation.odometry.grid import SLICE_NS, STEPS
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import even_shares
 from groundproc.machine.aside import aside
+from groundproc.machine.system import let_go
 from groundproc.numerics.planes import Placed, add_scatter, flattest_of
 from groundproc.numerics.voxelhash import assign, sorted_by, spread, voxel_key
 
@@ -102,7 +103,11 @@ def patches_of(gathered: Clusters, path: Path, window: int) -> Patches:
     """Patches of a window's clusters where its path places them."""
     chunk = (gathered.time_ns - path.start_ns) // (SLICE_NS * CHUNK)
     edges = np.searchsorted(chunk, np.arange(chunk[-1] + 2)) if len(chunk) else np.zeros(1, np.int64)
-    parts = [_merged(gathered, path, slice(int(first), int(last))) for first, last in pairwise(edges) if last > first]
+    parts = []
+    for first, last in pairwise(edges):
+        if last > first:
+            parts.append(_merged(gathered, path, slice(int(first), int(last))))
+            let_go()  # of a window's clusters no more is in memory than those of a chunk
     none = np.zeros(0)
     time_ns, place, scatter, count, draw = (
         (np.concatenate([part[i] for part in parts]) for i in range(5)) if parts else (none, none.reshape(0, 3), none, none, none)

@@ -199,6 +199,7 @@ def adjust_window(
     observations = [each.begin(stretch) for each in sources.observations] + ([] if tie is None else [tie])
     lidar = Lidar(track.gathered(first, last, sources.lasers_apart), retiming=retiming_of(observations, motion.source))
     track.forget(last - OVERLAP if more else last)
+    lidar.clusters.set_aside()
     give_back_memory()
     lidar.doubted = along_untold(track)[first:last]
     if motion.source == LIDAR:
@@ -213,7 +214,6 @@ def adjust_window(
         frame = coarse(batch.path)
         kept = {each.name: each.keep(batch.state(), frame) for each in observations}
         patches = patches_of(lidar.clusters, batch.path, len(before))
-    lidar.clusters.put_aside()
     batch.log[-1] |= posterior.figures()
     lidar.clusters = Clusters.none()  # what is left to do takes the rows alone, and much more
     give_back_memory()

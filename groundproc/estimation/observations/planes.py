@@ -15,6 +15,7 @@ from groundproc.estimation.observations.told import Poses, keep_told
 from groundproc.estimation.odometry.clusters import Clusters
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path, PathArrays
+from groundproc.machine.system import give_back_memory
 from groundproc.numerics.parts import at_once
 from groundproc.numerics.planeproducts import RowArrays
 from groundproc.numerics.planerows import PlaneRows
@@ -33,6 +34,8 @@ RANGE_SIGMA_M: Final = 0.02
 """Noise of a return (data sheet); what a voxel's own residuals show comes on top."""
 ROUGHNESS_M: Final = 0.006
 """Roughness of a surface before its residuals tell, one sigma of a cluster [m]."""
+_MANY: Final = 500_000
+"""Rows from which on what was freed goes back to the system while they are made: a minute's, and tens of megabytes."""
 _FEW: Final = 20_000
 """Clusters that are placed before a second thread has begun."""
 
@@ -171,6 +174,7 @@ def rows_of(
     n, knots, of_leaves = len(kept), knot[kept], leaves.variance_m2
     # a window has millions of clusters: what all of them have goes before the rows come, and rows are made some at a time
     del world, knot, order, good, keep, seen, planes, leaves
+    _make_room(n)
     rows = Rows(
         starts, knots, np.empty((n, 4), np.float32), np.empty((n, 6), np.float32), np.empty((n, 2), np.float32), np.empty(n), np.empty(n),
         np.empty((len(starts) - 1, 6)), kept, path.intervals,
@@ -185,9 +189,10 @@ def rows_of(
     rows.plane[flat:], variance[flat:] = 0.0, of_leaves  # they have no tilts
     rows.weigh(variance, ROUGHNESS_M, cut, voxel_m)
     del variance, of_leaves, fill
+    _make_room(n)
 
     def poses(part: slice) -> Poses:
-        some = _of(clusters, kept[part])
+        some = _instants(clusters, kept[part])
         return Poses(_place_all(some, path).rotation, some.xyz_m)
 
     keep_told(rows, poses, flat, voxel_m, means, doubted)
@@ -197,6 +202,7 @@ def rows_of(
             facing = np.repeat(normals[of], np.diff(starts)[of], axis=0)
             in_sensor[part] = np.einsum("nji,nj->ni", poses(part).rotation.reshape(-1, 3, 3), facing)
         rows.with_lasers(clusters.laser[kept], clusters.xyz_m[kept], in_sensor)
+    _make_room(n)
     if turning is not None:
         rows.with_retiming(turning, clusters.time_ns, path)
     if spin:
@@ -224,6 +230,18 @@ def _fill(
 def _of(clusters: Clusters, which: Knots) -> Clusters:
     """Some clusters, by their numbers; without their lasers."""
     return Clusters(clusters.time_ns[which], clusters.xyz_m[which], clusters.scatter_m2[which], clusters.count[which])
+
+
+def _instants(clusters: Clusters, which: Knots) -> Clusters:
+    """When and where the sensor saw some clusters, by their numbers: no more of them is read."""
+    none = Clusters.none()
+    return Clusters(clusters.time_ns[which], clusters.xyz_m[which], none.scatter_m2, none.count)
+
+
+def _make_room(rows: int) -> None:
+    """Have what was freed go back, where so many rows are large."""
+    if rows >= _MANY:
+        give_back_memory()
 
 
 def placed(clusters: Clusters, path: Path) -> tuple[Array, Singles]:

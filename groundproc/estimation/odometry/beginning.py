@@ -19,6 +19,7 @@ from groundproc.estimation.odometry.slices import Slice
 from groundproc.estimation.odometry.state import STATES, State
 from groundproc.estimation.odometry.track import KEPT, Track, thinned
 from groundproc.estimation.odometry.voxels import PlaneMap
+from groundproc.machine.system import let_go
 
 BEGINNING: Final = 150
 """Slices that are run again."""
@@ -81,6 +82,7 @@ def redo_beginning(
         laser = None if piece.laser is None else piece.laser[::-1].copy()
         step = odometry.step(Slice(count - 1 - k, end_ns - piece.time_ns[::-1], piece.xyz_m[::-1].copy(), laser))
         found[k] = copy.deepcopy(odometry.state), step
+        let_go()  # slices that were set aside, and have been read
     while odometry.number < count:
         odometry.propagate(odometry.number)
         found[count - odometry.number] = copy.deepcopy(odometry.state), None

@@ -1,18 +1,16 @@
 """Clusters of many slices, as columns."""
 
-import contextlib
-import io
-import tempfile
-import weakref
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from groundproc.machine.aside import aside
+
 Ints = npt.NDArray[np.int64]
 
 
-@dataclass(slots=True, weakref_slot=True)
+@dataclass(slots=True)
 class Clusters:
     """Clusters of all slices: columns of slices.CLUSTER_DTYPE.
 
@@ -31,30 +29,15 @@ class Clusters:
     scatter_m2: npt.NDArray[np.float32]
     count: npt.NDArray[np.int32]
     laser: npt.NDArray[np.int32] | None = None
-    _file: io.BufferedRandom | None = field(default=None, repr=False, compare=False)
 
-    def put_aside(self) -> None:
-        """Have the scatter, half of all, in a file until it is taken back; where a file has no room, it stays."""
-        if not len(self.scatter_m2):
-            return
-        if self._file is None:
-            try:
-                with contextlib.ExitStack() as stack:
-                    file = stack.enter_context(tempfile.TemporaryFile())
-                    file.write(np.ascontiguousarray(self.scatter_m2).data)
-                    file.flush()
-                    weakref.finalize(self, stack.pop_all().close)  # it goes with the clusters
-            except OSError:
-                return
-            self._file = file
-        self.scatter_m2 = np.empty((0, 6), np.float32)
-
-    def take_back(self) -> None:
-        """Have the scatter in memory again."""
-        if self._file is not None and not len(self.scatter_m2):
-            self.scatter_m2 = np.empty((len(self), 6), np.float32)
-            self._file.seek(0)
-            self._file.readinto(self.scatter_m2.data)
+    def set_aside(self) -> None:
+        """Have all columns in a file, of which is in memory what is read: a window has a hundred megabytes."""
+        lasers = () if self.laser is None else (self.laser,)
+        self.time_ns, self.xyz_m, self.scatter_m2, self.count, *lasers_aside = aside(
+            self.time_ns, self.xyz_m, self.scatter_m2, self.count, *lasers
+        )
+        if lasers_aside:
+            (self.laser,) = lasers_aside
 
     @classmethod
     def none(cls) -> "Clusters":
