@@ -85,9 +85,11 @@ def adjusted_estimate(given: Given, progress: Progress, more: Sequence[Observati
             f"adjusted: a {given.lidar.name} has {len(given.lidar.lasers)} laser; at least {LEAST_LASERS} are needed to see "
             "a surface again at once"
         )
+    give_back_memory()
     begun = begun_from(given, progress)
     start, begun_sigma_source = begun.trajectory.set_aside(), begun.sigma_source
     del begun
+    give_back_memory()
     made: list[Run | CausalRun] = []
     numbers: list[int] = []
     reasons: list[LogError] = []

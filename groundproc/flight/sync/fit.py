@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.sparse.linalg import splu
 
 from flightlog.constants import NS_PER_S
@@ -15,12 +15,20 @@ from flightlog.frames import mat_from_quat, quat_exp
 from groundproc.flight.sync.correlation import Peak
 from groundproc.flight.sync.result import Sync
 from groundproc.flight.sync.tracks import GyroTrack, low_pass
+from groundproc.machine.aside import aside
+from groundproc.machine.system import let_go
 from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
 
 FINE_HZ: Final = 400.0
 """Rate at which the fast gyro is smoothed for the fit."""
+ROWS: Final = 1 << 14
+"""Samples that are looked at together."""
+PART: Final = 1 << 18
+"""Values that a spline goes through, about, ten minutes; a longer one is made of several."""
+BESIDE: Final = 64
+"""Values on either side that belong to the next."""
 BIAS_KNOT_S: Final = 30.0
 """Spacing of the linear spline that takes up both gyros' biases and their drift."""
 DRIFT_PRIOR_PPM: Final = 60.0
@@ -38,7 +46,6 @@ def fit(lidar: GyroTrack, ins: GyroTrack, peak: Peak, cutoff_hz: float, mat_moun
     Model of a sample at time t: rotation @ rate(t - offset - drift (t - mid)) + bias(t), rate being the smoothed fast gyro.
     """
     smooth = _smooth_spline(lidar, cutoff_hz)
-    slope = smooth.derivative()
     time_s = (ins.time_ns - peak.offset_ns - lidar.time_ns[0]) * 1e-9
     inside = (time_s > 0.5) & (time_s < (lidar.time_ns[-1] - lidar.time_ns[0]) * 1e-9 - 0.5)
     time_s, rate = time_s[inside], ins.rate_rad_s[inside]
@@ -51,11 +58,11 @@ def fit(lidar: GyroTrack, ins: GyroTrack, peak: Peak, cutoff_hz: float, mat_moun
     prior = np.array([0.0, (DRIFT_PRIOR_PPM * 1e-6) ** -2, *[ROTATION_PRIOR_RAD**-2] * 3])
     for _ in range(20):
         at = time_s - shift[0] - shift[1] * (time_s - mid_s)
-        turned, moved = smooth(at) @ rotation.T, slope(at) @ rotation.T
+        turned, moved = smooth(at) @ rotation.T, smooth(at, 1) @ rotation.T
         residual = unbias(rate - turned)
         axes = np.eye(3)
         columns = [-moved, -moved * (time_s - mid_s)[:, None], *(np.cross(axis, turned) for axis in axes)]
-        jacobian = unbias(np.concatenate(columns, axis=1)).reshape(len(time_s), len(columns), 3).swapaxes(1, 2)
+        jacobian = np.stack([unbias(column) for column in columns], axis=2)
         weight, curvature = _weights(residual, moved)
         normal = np.einsum("nki,nk,nkj->ij", jacobian, weight, jacobian) + np.diag(prior)
         score = np.einsum("nki,nk,nk->i", jacobian, weight, residual)
@@ -123,18 +130,30 @@ def _weights(residual: Array, moved: Array) -> tuple[Array, Array]:
     axis = np.maximum(robust.sigma_of_columns(residual, 0.0), 1e-6) ** 2
     variance = np.broadcast_to(axis, residual.shape)
     for _ in range(3):
-        square = np.minimum(residual**2, 25.0 * variance).ravel()
-        # each axis its own level, one jitter for all
-        design = np.zeros((residual.size, 4))
-        design[np.arange(residual.size), np.tile(np.arange(3), len(residual))] = 1.0
-        design[:, 3] = moved.ravel() ** 2
-        relative = design / variance.reshape(-1, 1)
-        level, *_ = np.linalg.lstsq(relative, square / variance.ravel(), rcond=None)
+        square = np.minimum(residual**2, 25.0 * variance)
+        level = _levels(square, np.square(moved), variance)
         level = np.maximum(level, [*(0.05 * axis), 0.0])
         variance = level[:3] + level[3] * moved**2
     normed = np.abs(residual) / np.sqrt(variance)
     inlier = normed <= HUBER
     return robust.huber(normed, HUBER) / variance, inlier / variance
+
+
+def _levels(square: Array, slope: Array, variance: Array) -> Array:
+    """Each axis's own level and one jitter for all that explain squares of residuals best, shape (4,); all given have shape (n, 3).
+
+    Least squares by rows of some minutes at a time, each reduced to the triangle that it leaves (QR).
+    """
+    left = np.empty((0, 5))
+    for begin in range(0, len(square), ROWS):
+        some = slice(begin, begin + ROWS)
+        rows = np.zeros((len(square[some]), 3, 5))
+        rows[:, np.arange(3), np.arange(3)] = 1.0
+        rows[:, :, 3], rows[:, :, 4] = slope[some], square[some]
+        rows /= variance[some][:, :, None]
+        left = np.linalg.qr(np.concatenate([left, rows.reshape(-1, 5)]), mode="r")
+    level, *_ = np.linalg.lstsq(left[:, :4], left[:, 4], rcond=np.finfo(np.float64).eps * square.size)
+    return np.asarray(level)
 
 
 def _covariance(time_s: Array, scores: Array, normal: Array) -> Array:
@@ -156,8 +175,44 @@ def _covariance(time_s: Array, scores: Array, normal: Array) -> Array:
     return np.asarray(plain * np.outer(factor, factor))
 
 
-def _smooth_spline(track: GyroTrack, cutoff_hz: float) -> CubicSpline:
+def _smooth_spline(track: GyroTrack, cutoff_hz: float) -> "_Smooth":
     seconds = (track.time_ns - track.time_ns[0]) * 1e-9
     grid = np.arange(0.0, seconds[-1] + 1.0 / FINE_HZ, 1.0 / FINE_HZ)
     values = np.stack([np.interp(grid, seconds, axis) for axis in track.rate_rad_s.T], axis=1)
-    return CubicSpline(grid, low_pass(values, cutoff_hz, FINE_HZ), axis=0)
+    return _Smooth(grid, low_pass(values, cutoff_hz, FINE_HZ))
+
+
+class _Smooth:
+    """A cubic spline of a rate, made and asked some minutes at a time: of an hour its coefficients are 140 MB.
+
+    Parameters
+    ----------
+    grid_s : ndarray, shape (n,)
+    values : ndarray, shape (n, 3)
+
+    Attributes
+    ----------
+    ends_s : tuple of float
+        The first and the last time.
+    """
+
+    def __init__(self, grid_s: Array, values: Array) -> None:
+        self.ends_s = float(grid_s[0]), float(grid_s[-1])
+        self._begins: list[float] = []
+        self._parts: list[PPoly] = []
+        for begin in range(0, len(grid_s), PART):
+            # a spline forgets its ends by a factor of four with each value
+            some = slice(max(begin - BESIDE, 0), begin + PART + BESIDE)
+            spline = CubicSpline(grid_s[some], values[some], axis=0)
+            self._parts.append(PPoly.construct_fast(*aside(spline.c, spline.x)))
+            self._begins.append(grid_s[begin])
+
+    def __call__(self, at_s: Array, derivative: int = 0) -> Array:
+        """Values at times, or derivatives, shape (m, 3)."""
+        out = np.empty((len(at_s), 3))
+        part = np.maximum(np.searchsorted(self._begins, at_s, side="right") - 1, 0)
+        for number, spline in enumerate(self._parts):
+            mine = part == number
+            out[mine] = spline(at_s[mine], derivative)
+            let_go()
+        return out

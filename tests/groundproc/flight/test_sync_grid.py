@@ -1,5 +1,6 @@
 """What the correlation makes of gyros before and after it correlates, and the fit's ends: each against a law of its own."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -270,8 +271,21 @@ def test_the_smoothed_gyro_is_the_filters_to_both_ends_and_between_samples(hz: f
     smooth = _smooth_spline(GyroTrack("a", 5 * S + ticks(time_s), sines(time_s, hz)), 5.0)
     at = np.random.default_rng(3).uniform(2.0, 18.0, 200)
     np.testing.assert_allclose(smooth(at), gain(hz, 5.0) * sines(at, hz), rtol=0, atol=1.5e-3)
-    assert smooth.x[0] == 0.0
-    assert time_s[-1] <= smooth.x[-1] < time_s[-1] + 2.0 / 400.0
+    first, last = smooth.ends_s
+    assert first == 0.0
+    assert time_s[-1] <= last < time_s[-1] + 2.0 / 400.0
+
+
+def test_a_long_gyro_is_smoothed_in_parts_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values and slopes on both sides of where the parts meet, and there."""
+    lidar = noise(30.0, 200.0)
+    at = np.random.default_rng(4).uniform(0.0, 30.0, 5000)
+    whole = _smooth_spline(lidar, 20.0)
+    monkeypatch.setattr(sys.modules[_smooth_spline.__module__], "PART", 1000)
+    parts = _smooth_spline(lidar, 20.0)
+    for derivative in (0, 1):
+        scale = np.abs(whole(at, derivative)).max()
+        np.testing.assert_allclose(parts(at, derivative), whole(at, derivative), rtol=0, atol=1e-11 * scale)
 
 
 def pair(seconds: float = 60.0) -> tuple[GyroTrack, GyroTrack, Peak]:
