@@ -1,7 +1,7 @@
 """Offset, drift and rotation by least squares, to the slow gyro's samples as they were recorded."""
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -151,7 +151,8 @@ def _levels(square: Array, slope: Array, variance: Array) -> Array:
         rows[:, np.arange(3), np.arange(3)] = 1.0
         rows[:, :, 3], rows[:, :, 4] = slope[some], square[some]
         rows /= variance[some][:, :, None]
-        left = np.linalg.qr(np.concatenate([left, rows.reshape(-1, 5)]), mode="r")
+        triangle: Any = np.linalg.qr(np.concatenate([left, rows.reshape(-1, 5)]), mode="r")
+        left = triangle
     level, *_ = np.linalg.lstsq(left[:, :4], left[:, 4], rcond=np.finfo(np.float64).eps * square.size)
     return np.asarray(level)
 
@@ -204,7 +205,8 @@ class _Smooth:
             # a spline forgets its ends by a factor of four with each value
             some = slice(max(begin - BESIDE, 0), begin + PART + BESIDE)
             spline = CubicSpline(grid_s[some], values[some], axis=0)
-            self._parts.append(PPoly.construct_fast(*aside(spline.c, spline.x)))
+            coefficients, knots = aside(spline.c, spline.x)
+            self._parts.append(PPoly.construct_fast(coefficients, knots))
             self._begins.append(grid_s[begin])
 
     def __call__(self, at_s: Array, derivative: int = 0) -> Array:
