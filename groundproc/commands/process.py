@@ -220,13 +220,15 @@ def _report(quality: dict[str, Any], folder: Path) -> list[tuple[str, str]]:
     sync, points, track = quality["sync"], quality["points"], quality["trajectory"]
     crs, height = quality["crs"], quality["height"]
     east, north, up = track["median_sigma_m"]
+    roll, pitch, heading = track["median_sigma_attitude_deg"]
     lines = [
         ("points", f"{points['written']:,} points in EPSG:{crs['epsg']} ({crs['name']}), heights {height['meaning']}"),
         *(("", line) for line in _left_out(points.get("left_out", {}))),
         (
             "trajectory",
             f"trajectory by {track['method']}: {track['covered_s']:.1f} s from {track['start']}, "
-            f"sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up)"
+            f"sigma {east:.2f} / {north:.2f} / {up:.2f} m (east, north, up), "
+            f"{roll:.2f} / {pitch:.2f} / {heading:.2f} deg (roll, pitch, heading)"
             + (f"; {track['note']}" if track["note"] else ""),
         ),
         (

@@ -75,6 +75,9 @@ def facts(quality: Quality, density: float | None, area_m2: float | None) -> Htm
     """The figures that people ask for first."""
     track, sync = quality["trajectory"], quality["sync"]
     east, north, up = track["median_sigma_m"]
+    *level, heading = track.get(
+        "median_sigma_attitude_deg", (math.nan,) * 3
+    )  # figures made by an older swath have none
     rows = [
         ("Points", count(quality["points"]["written"])),
         ("Flown", f"{track['covered_s']:.0f} s"),
@@ -82,6 +85,8 @@ def facts(quality: Quality, density: float | None, area_m2: float | None) -> Htm
         ("Density, median", "" if density is None else f"{density:.0f} /m²"),
         ("Position in plan, one sigma", length(math.hypot(east, north))),
         ("Height, one sigma", length(up)),
+        ("Level, one sigma", f"{max(level):.2f}°" if math.isfinite(max(level)) else ""),
+        ("Heading, one sigma", f"{heading:.2f}°" if math.isfinite(heading) else ""),
         ("Clocks, one sigma", f"{sync['sigma_s'] * 1e3:.2f} ms"),
     ]
     return tag("dl", [tag("div", tag("dt", name), tag("dd", value)) for name, value in rows if value], class_="facts")

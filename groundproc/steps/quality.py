@@ -66,6 +66,7 @@ def describe(survey: Survey, made: Estimate, tied: dict[str, Any], placed: dict[
             "gaps_s": float(seconds[~trajectory.covered[:-1]].sum()),
             "median_sigma_m": np.median(trajectory.sigma_position_m, axis=0).tolist(),
             "largest_sigma_m": np.max(trajectory.sigma_position_m, axis=0).tolist(),
+            "median_sigma_attitude_deg": np.rad2deg(np.median(trajectory.sigma_attitude_rad, axis=0)).tolist(),
             "turn_rate_deg_s": turn_rate_deg_s(trajectory),
             "sigma_source": made.sigma_source,
             "note": made.note,

@@ -19,6 +19,11 @@ POSITION_M: Final = (10.0, 15.0)
 """In plan, each axis, and in height: a receiver of 2.5 m at a dilution of precision of 4, beyond which it counts as poor."""
 POSITION_HOPELESS_M: Final = 50.0
 """As far as the lidar sees the ground from the usual height: the cloud shows another place than it says."""
+LEVEL_DEG: Final = 2.0
+"""One sigma of roll and pitch: a poor autopilot's. 30 m away, a usual range, a point then lies 1 m beside its place."""
+HEADING_DEG: Final = 10.0
+"""One sigma: a poor compass's; a point 30 m away then lies 5 m beside its place."""
+USUAL_RANGE_M: Final = 30.0
 NO_MOUNT: Final = "firmware_config/mount.yaml"
 """What a mount's source says where neither log nor user stated one."""
 
@@ -82,6 +87,29 @@ def _position(sigma_m: Sequence[float], what: str, hopeless: bool) -> Reason | N
     )
 
 
+def _attitude(quality: Figures) -> Iterator[Reason]:
+    found = quality["trajectory"].get("median_sigma_attitude_deg")
+    if not found:
+        return
+    level_deg, heading_deg = max(found[:2]), found[2]
+    # a sigma that nobody stated is not a number, and no reason
+    if level_deg > LEVEL_DEG or heading_deg > HEADING_DEG:
+        off_m = USUAL_RANGE_M * math.radians(max(level_deg, heading_deg))
+        yield Reason(
+            DOUBTFUL,
+            "attitude",
+            f"the lidar's level is known to {level_deg:.1f} deg and its heading to {heading_deg:.1f} deg (one sigma), which "
+            f"moves points {USUAL_RANGE_M:.0f} m away by up to {off_m:.1f} m, expected {LEVEL_DEG:g} and {HEADING_DEG:g} deg "
+            f"or better{_remedy(quality)}",
+        )
+
+
+def _remedy(quality: Figures) -> str:
+    """What would know the attitude better."""
+    measured = quality["trajectory"]["method"] == "adjusted" and not quality["config"]["causal"]
+    return "" if measured else "; the adjustment over the whole flight (`--method adjusted`) measures them"
+
+
 def _mount(quality: Figures) -> Iterator[Reason]:
     source = quality["mount"]["source"]
     if source == NO_MOUNT or source.endswith(f"begun from {NO_MOUNT}"):
@@ -106,7 +134,7 @@ def _points(quality: Figures) -> Iterator[Reason]:
     yield from lost_packets(lidar["lost_packets"], lidar["packets"], lidar["aboard"])
 
 
-FLIGHT_RULES: Final[tuple[Rule, ...]] = (_inputs, _clocks, _autopilot, _trajectory, _mount, _points)
+FLIGHT_RULES: Final[tuple[Rule, ...]] = (_inputs, _clocks, _autopilot, _trajectory, _attitude, _mount, _points)
 
 
 def judge_flight(quality: Figures) -> Verdict:

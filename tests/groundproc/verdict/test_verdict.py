@@ -48,9 +48,12 @@ FLIGHT: Figures = {
         "gaps_s": 0.0,
         "median_sigma_m": [3.0, 3.0, 4.5],
         "largest_sigma_m": [3.0, 3.0, 4.5],
+        "median_sigma_attitude_deg": [0.02, 0.02, 0.4],
         "turn_rate_deg_s": 40.0,
+        "method": "adjusted",
         "warning": "",
     },
+    "config": {"causal": False},
     "mount": {"source": "log"},
     "points": {
         "written": 10_000_000,
@@ -156,6 +159,8 @@ def test_small_losses_and_what_is_not_known_are_no_reason(path: str, value: Any)
         ("trajectory/median_sigma_m", [12.0, 3.0, 4.5], DOUBTFUL, "position", "12.0 m in plan"),
         ("trajectory/largest_sigma_m", [3.0, 3.0, 40.0], DOUBTFUL, "position", "at worst 3.0 m in plan and 40.0 m"),
         ("trajectory/median_sigma_m", [3.0, 300.0, 4.5], BAD, "position", "300.0 m in plan"),
+        ("trajectory/median_sigma_attitude_deg", [2.5, 0.2, 0.4], DOUBTFUL, "attitude", "level is known to 2.5 deg"),
+        ("trajectory/median_sigma_attitude_deg", [0.1, 0.1, 11.0], DOUBTFUL, "attitude", "30 m away by up to 5.8 m"),
         ("trajectory/warning", "it has not settled", DOUBTFUL, "warning", "it has not settled"),
         ("mount/source", "firmware_config/mount.yaml", DOUBTFUL, "mount", "--mount FILE"),
         ("mount/source", "estimated by adjusted, begun from firmware_config/mount.yaml", DOUBTFUL, "mount", "--mount"),
@@ -181,6 +186,14 @@ def test_a_coarse_tie_is_enough_for_a_sensor_that_hardly_turns() -> None:
 
 def test_a_sigma_that_nobody_stated_is_no_reason() -> None:
     assert judge_flight(changed(FLIGHT, "trajectory/median_sigma_m", [float("nan")] * 3)).grade == GOOD
+    assert judge_flight(changed(FLIGHT, "trajectory/median_sigma_attitude_deg", [float("nan")] * 3)).grade == GOOD
+
+
+def test_an_attitude_that_was_not_measured_says_what_would_measure_it() -> None:
+    stated = changed(FLIGHT, "trajectory/median_sigma_attitude_deg", [1.0, 1.0, 12.0])
+    assert "--method adjusted" not in judge_flight(stated).line()
+    for path, value in (("trajectory/method", "ins"), ("config/causal", True)):
+        assert "--method adjusted" in judge_flight(changed(stated, path, value)).line()
 
 
 def test_a_warning_anywhere_in_the_figures_is_a_reason_whoever_wrote_it() -> None:
