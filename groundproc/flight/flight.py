@@ -23,6 +23,7 @@ from groundproc.flight.sync import GyroTrack
 from groundproc.flight.timeline import LidarRun
 from groundproc.flight.vehicle import Choice
 from groundproc.machine.aside import aside
+from groundproc.machine.system import give_back_memory
 from groundproc.sensors.model import Lidar
 
 Progress = Callable[[int], None]
@@ -117,6 +118,8 @@ def read_flight(readers: Sequence[LogReader], link: str, progress: Progress | No
     if not runs:
         raise LogError(_NO_LIDAR.format(readers[0].path))
     choice = vehicle.choose(merged.vehicles, runs)
+    kept.clear()  # as objects the frames are several times as large as the tables made of them
+    give_back_memory()
     choice = replace(choice, notes=choice.notes + merged.notes)
     return Flight(
         choice.vehicle.boots,

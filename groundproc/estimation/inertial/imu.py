@@ -7,7 +7,7 @@ readings in fast motion. At low frequency it is pulled towards the autopilot's b
 noise, which follows from the difference of the two (Wiener).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from groundproc.flight.sync.tracks import low_pass
+from groundproc.machine.aside import aside
 from groundproc.numerics import robust
 from groundproc.numerics.filters import butterworth, forward_and_back, spectrum
 
@@ -112,6 +113,11 @@ class Signal:
     sources: str
     share: float = 1.0
     alignment: Alignment | None = None
+
+    def set_aside(self) -> "Signal":
+        """The same in a file, of which is in memory what is read."""
+        mean, density, known = aside(self.mean, self.density, self.known)
+        return replace(self, mean=mean, density=density, known=known)
 
 
 def noise_density(samples: Samples, time_s: Array) -> Array:

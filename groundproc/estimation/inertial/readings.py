@@ -156,8 +156,8 @@ def read(
         [each.between(start_ns, start_ns + round(nodes_s[-1] * NS_PER_S)) for each in outside],
         normal_gravity(frame.latitude_deg, frame.height_m),
         int((~kept).sum()),
-        gyro,
-        force,
+        None if gyro is None else gyro.set_aside(),
+        None if force is None else force.set_aside(),
     )
 
 

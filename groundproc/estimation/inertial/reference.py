@@ -11,6 +11,7 @@ from flightlog import frames
 from groundproc.estimation.inertial.readings import UNKNOWN_FORCE_DENSITY, UNKNOWN_RATE_DENSITY, Readings
 from groundproc.estimation.observations.measured import Reference
 from groundproc.estimation.observations.states import ATTITUDE, POSITION, VELOCITY
+from groundproc.machine.aside import aside
 from groundproc.numerics.rotations import quat_difference_outside, quat_multiply, quat_turned_by
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +38,7 @@ class Steps:
 
 
 def steps_of(r: Readings) -> Steps:
-    """Where no gyro was, the attitudes' own differences; where no accelerometer was, the velocities'."""
+    """Where no gyro was, the attitudes' own differences; where no accelerometer was, the velocities'. In a file, as the readings are."""
     steps = len(r.nodes_s) - 1
     middle = 0.5 * (r.nodes_s[1:] + r.nodes_s[:-1])
     left = np.clip(np.searchsorted(r.attitude_s, middle) - 1, 0, len(r.attitude_s) - 2)
@@ -63,7 +64,7 @@ def steps_of(r: Readings) -> Steps:
         force_known = r.force.known
         force = np.where(force_known[:, None], r.force.mean, 0.0)
         force_density = np.where(force_known, r.force.density, force_density)
-    return Steps(rate, force, rate_density, force_density, known, force_known)
+    return Steps(*aside(rate, force, rate_density, force_density, known, force_known))
 
 
 def begun(r: Readings, steps: Steps) -> Reference:

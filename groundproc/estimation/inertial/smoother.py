@@ -18,6 +18,7 @@ from groundproc.estimation.observations import measured_of
 from groundproc.estimation.observations.measured import Heard, Learnt, Measured, Reference, Rows, System
 from groundproc.estimation.observations.states import ATTITUDE, GYRO_BIAS, HEADING, POSE, POSITION, STATES, TILT, Model
 from groundproc.flight.timeline import Leg
+from groundproc.machine.system import let_go
 from groundproc.numerics import robust
 
 Array = npt.NDArray[np.float64]
@@ -71,19 +72,25 @@ def solve(
     heard = Heard(readings, standing(readings), drives(readings), given, leg)
     sources = measured_of(heard)
     noise = {kind: learnt for source in sources for kind, learnt in source.learnt.items()}
-    first = reference = begun(readings, steps)
+    reference = begun(readings, steps)
+    first = Reference(reference.position_m[:1].copy(), reference.velocity_m_s[:1].copy(), reference.quat[:1].copy())
     weight: Array | None = None
     out: kalman.Smoothed | None = None
+    done: _Smoothed | None = None
     for iteration in range(1, ITERATIONS + 1):
+        done = None  # its rows are large: they go before new ones are made
         system = _system(sources, readings, reference, steps, model)
         out = _room(readings, system) if out is None else out
         variance = system.variance if weight is None else system.variance / weight
+        motion = motion_about(readings, model, steps, reference)
+        let_go()
         kalman.smooth(
-            motion_about(readings, model, steps, reference),
+            motion,
             kalman.Rows(system.first, system.count, system.index, system.value, system.measured, variance),
             *start_about(readings, model, first, reference),
             out,
         )
+        del motion
         reference = corrected(reference, out.correction)
         done = _Smoothed(model, reference, system, weight, out, _largest(out, POSITION), _largest(out, ATTITUDE))
         if iteration >= FEWEST_ITERATIONS and done.settled:
@@ -91,6 +98,7 @@ def solve(
         if iteration <= FEWEST_ITERATIONS:
             model = _learnt(model, noise, system, out)
         weight = robust.cauchy(out.residual / _noise(noise, system, model) / OUTLIER)
+    assert done is not None
     return _solution(readings, heard, steps, done, iteration)
 
 
