@@ -118,7 +118,7 @@ def note(text: str) -> None:
 def process(log: Path, folder: Path, *words: str) -> tuple[float, float, float]:
     """`swath process` into an empty folder: seconds by the clock, CPU time [s], highest resident memory [GB]."""
     shutil.rmtree(folder, ignore_errors=True)
-    program = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+    program = "import sys; from groundproc.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "process", log, "-o", folder, *words]
     peak_kb, began = 0, time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(ROOT)}) as child:
@@ -239,7 +239,7 @@ def workers(bench: Bench) -> Figures:
             flights = [{"name": name, "logs": [str(bench.log)]} for name in "ab"]
             # JSON is YAML
             file.write_text(json.dumps({"output": str(bench.folder / f"campaign{count}"), "flights": flights}))
-            program = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+            program = "import sys; from groundproc.cli import main; sys.exit(main())"
             began = time.perf_counter()
             command = [sys.executable, "-c", program, "batch", file, "--scheduler", address]
             done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
@@ -343,7 +343,7 @@ def main() -> int:
         folder, log = Path(name), asked.log
         if log is None:
             log = folder / "flight" / "flight.mcap"
-            program = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+            program = "import sys; from groundproc.cli import main; sys.exit(main())"
             words = ["simulate", "--flight", FLIGHT, "--duration", str(asked.seconds), "--seed", "11", "-o", log.parent]
             subprocess.run([sys.executable, "-c", program, *words], check=True, stdout=subprocess.DEVNULL)
         bench, found = Bench(folder, log, asked.seconds, asked.minutes, asked.rounds), Figures()

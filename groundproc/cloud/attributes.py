@@ -23,6 +23,7 @@ from groundproc.cloud.mixing import Mixing
 from groundproc.cloud.points import Points
 from groundproc.cloud.pointsigma import Errors, MountErrors
 from groundproc.cloud.surroundings import Surroundings
+from groundproc.cloud.voxelnumbers import VoxelNumbers
 from groundproc.machine import readahead
 from groundproc.machine.system import give_back_memory
 from groundproc.sensors.model import Ranging
@@ -150,7 +151,7 @@ def described(stream: Stream, scene: Scene, names: frozenset[str], found: Found 
         return
     ahead, along, behind = (stream() for _ in range(3))
     for stretch in itertools.count():
-        around, pieces, count = _gathered(ahead, scene)
+        around, voxels, pieces, count = _gathered(ahead, scene)
         if not pieces:
             return
         if not stretch and not around.full:
@@ -158,38 +159,39 @@ def described(stream: Stream, scene: Scene, names: frozenset[str], found: Found 
         around.find_planes()
         classes: cleaning.Classes | None = None
         if "classes" in names:
-            classes = cleaning.classify(around, _looked(around, itertools.islice(along, pieces), scene))
+            classes = cleaning.classify(around, _looked(around, voxels.beside(itertools.islice(along, pieces)), scene))
             found.stretches.append(classes.of_stretch)
         around.keep_planes_only()
         mixing = Mixing(around) if classes is not None and classes.of_stretch.trusted else None
         give_back_memory()  # while points are handed on, the products take the most
-        for points in itertools.islice(behind, pieces):
-            points = _with_attributes(points, scene, names, _Known(around, classes, mixing))
+        for points, voxel in voxels.beside(itertools.islice(behind, pieces)):
+            points = _with_attributes(points, scene, names, _Known(around, classes, mixing, voxel))
             found.add(points)
             yield points
-        del around, classes, mixing  # the next stretch takes their memory
+        del around, voxels, classes, mixing  # the next stretch takes their memory
 
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """What lies around the points of a stretch; where asked for, classes of its voxels and, if these are trusted, what is mixed."""
+    """What lies around some points of a stretch, and their voxels; where asked for, classes of these and, if trusted, what is mixed."""
 
     around: Surroundings
     classes: cleaning.Classes | None
     mixing: Mixing | None
+    voxel: npt.NDArray[np.int32]
 
 
-def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> freespace.Looks:
-    """What the beams of a stretch passed through, as `freespace.Evidence` has it."""
+def _looked(
+    around: Surroundings, pieces: Iterable[tuple[Points, npt.NDArray[np.int32]]], scene: Scene
+) -> freespace.Looks:
+    """What the beams of a stretch, its points with their voxels, passed through, as `freespace.Evidence` has it."""
     lookout = freespace.Lookout(around)
 
     def rays() -> Iterator[tuple[Any, ...]]:
-        for points in pieces:
+        for points, voxel in pieces:
             if len(points):
                 origins = Beams.of(points.time_ns, scene.trajectory, scene.mount).origins(points.time_ns)
-                voxel = around.of(points.xyz_m)
-                slant = around.incidence_deg(points.xyz_m, origins, voxel)
-                yield points.xyz_m, origins, points.time_ns, slant, voxel
+                yield points.xyz_m, origins, points.time_ns, voxel
 
     with contextlib.closing(readahead.ahead(rays())) as made:
         for some in made:
@@ -198,17 +200,18 @@ def _looked(around: Surroundings, pieces: Iterable[Points], scene: Scene) -> fre
     return lookout.evidence.open_looks
 
 
-def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, int, int]:
-    """The surroundings of the next stretch of flight, and the numbers of its pieces and of its points."""
+def _gathered(ahead: Iterator[Points], scene: Scene) -> tuple[Surroundings, VoxelNumbers, int, int]:
+    """The surroundings of the next stretch of flight, the voxels of its points, and the numbers of its pieces and of its points."""
     around, pieces, count = Surroundings(), 0, 0
+    voxels = VoxelNumbers(around)
     for points in ahead:
         pieces, count = pieces + 1, count + len(points)
         if len(points):
             beams = Beams.of(points.time_ns, scene.trajectory, scene.mount)
-            around.add(points.xyz_m, points.time_ns, beams.origins(points.time_ns))
+            voxels.keep(around.add(points.xyz_m, points.time_ns, beams.origins(points.time_ns)))
         if around.full:
             break
-    return around, pieces, count
+    return around, voxels, pieces, count
 
 
 def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known: _Known | None) -> Points:
@@ -225,16 +228,15 @@ def _with_attributes(points: Points, scene: Scene, names: frozenset[str], known:
         line = np.searchsorted(scene.line_begins_ns, points.time_ns, side="right") + 1
         columns["point_source_id"] = np.minimum(line, _LAST_LINE).astype(np.uint16)
     if known is not None:
-        voxel = known.around.of(points.xyz_m)
-        slant = known.around.incidence_deg(points.xyz_m, origins, voxel)
+        slant = known.around.incidence_deg(points.xyz_m, origins, known.voxel)
         if "incidence" in names:
             columns["incidence"] = slant
         if known.classes is not None:
-            columns["classification"] = known.classes.of_voxel[voxel]
+            columns["classification"] = known.classes.of_voxel[known.voxel]
             columns["mixed"] = (
                 np.zeros(len(points), np.uint8)
                 if known.mixing is None
-                else known.mixing.of(points.xyz_m, origins, voxel)
+                else known.mixing.of(points.xyz_m, origins, known.voxel)
             )
     if "sigma" in names:
         errors = Errors.of(points.time_ns, scene.trajectory, scene.mount, scene.mount_errors)

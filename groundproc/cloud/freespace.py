@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from groundproc.cloud.surroundings import LOOK_MS, Surroundings
+from groundproc.cloud.surroundings import LOOK_MS, Surroundings, slant_deg
 from groundproc.cloud.voxels import Voxels, find, middle_of, signed
 from groundproc.machine.system import cores
 from groundproc.numerics.voxelhash import spread, voxel_key
@@ -100,12 +100,11 @@ class _Maps(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Beams: echoes and places of the sensor, shape (n, 3), times since the begin, incidences, voxels of the echoes, shape (n,)."""
+    """Beams: echoes and places of the sensor, shape (n, 3), times since the begin and voxels of the echoes, shape (n,)."""
 
     xyz_m: Array
     origin_m: Array
     time_ms: Times
-    incidence_deg: npt.NDArray[np.float32]
     voxel: Ints
 
 
@@ -141,11 +140,9 @@ class Lookout:
             cube_part,
         )
 
-    def look_along(
-        self, xyz_m: Array, origins_m: Array, time_ns: Times, incidence_deg: npt.NDArray[np.float32], voxel: Ints
-    ) -> None:
+    def look_along(self, xyz_m: Array, origins_m: Array, time_ns: Times, voxel: Ints) -> None:
         """Add what the beams of points, shape (n, 3), that lie in voxels, shape (n,), say of all voxels; in the order of time."""
-        rays = _Rays(xyz_m, origins_m, self._around.elapsed_ms(time_ns), incidence_deg, voxel)
+        rays = _Rays(xyz_m, origins_m, self._around.elapsed_ms(time_ns), voxel)
         if self._threads == 1:
             _look(rays, self._maps, self.evidence, 0)
             return
@@ -189,7 +186,7 @@ def _look(rays: _Rays, maps: _Maps, evidence: Evidence, part: int) -> None:
         length = np.sqrt(ux * ux + uy * uy + uz * uz)
         if length < BEGIN_M + BEYOND_M:
             continue
-        slant = np.float64(rays.incidence_deg[n])
+        slant = np.float64(slant_deg(rays.xyz_m, rays.origin_m, n, maps.voxels.normal, rays.voxel[n]))
         cosine = 0.2 if np.isnan(slant) else max(np.cos(np.deg2rad(slant)), 0.02)
         end = length - max(BEYOND_M, SKIMS_M / cosine)
         if end > BEGIN_M:

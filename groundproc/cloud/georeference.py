@@ -254,7 +254,7 @@ def extent(xyz_m: Any) -> Any:
     return low, high
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def strays(xyz_m: Any, most_m: float) -> Any:
     """Number of points, shape (n, 3), with a coordinate that is no number or beyond so much either way."""
     found = 0

@@ -77,8 +77,8 @@ class Surroundings(VoxelMap):
         """Whether the stretch of flight is to end here."""
         return self.used > MOST
 
-    def add(self, xyz_m: Array, time_ns: Times, origins_m: Array) -> None:
-        """Take points, shape (n, 3), with their times and the places of the sensor.
+    def add(self, xyz_m: Array, time_ns: Times, origins_m: Array) -> Ints:
+        """Take points, shape (n, 3), with their times and the places of the sensor; gives the voxel of each, as `of` does, shape (n,).
 
         Their voxels are found here, and their sums taken by a thread beside, in their order; `settle` waits for it.
         """
@@ -86,15 +86,16 @@ class Surroundings(VoxelMap):
             self.begin_ns = int(time_ns[0])
         elapsed_ms = self.elapsed_ms(time_ns)
         self.settle()  # points of one piece wait, and no more
+        voxels = np.empty(len(xyz_m), np.int32)
         for begin in range(0, len(xyz_m), _SOME):
             some = slice(begin, begin + _SOME)
             if self.used + _SOME > len(self.voxels.key):
                 self.settle()  # the sums are about to be copied
             self.make_room(len(xyz_m[some]))
-            voxel = np.empty(len(xyz_m[some]), np.int32)
-            self.used = int(_number(xyz_m[some], self.edge_m, self.table, self.voxels.key, self.used, voxel))
+            self.used = int(_number(xyz_m[some], self.edge_m, self.table, self.voxels.key, self.used, voxels[some]))
             seen = xyz_m[some], elapsed_ms[some], origins_m[some]
-            self._beside.do(functools.partial(_add, *seen, voxel, self.edge_m, self.voxels))
+            self._beside.do(functools.partial(_add, *seen, voxels[some], self.edge_m, self.voxels))
+        return voxels
 
     def settle(self) -> None:
         """Wait until all points that were given are in the sums."""
@@ -320,16 +321,20 @@ def _borrow(table: Any, voxels: Voxels, used: int, edge_m: float) -> None:
             normal[v] = normal[chosen[v]]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def slant_deg(xyz: Any, origin: Any, n: Any, normal: Any, v: Any) -> Any:
+    """Angle between the beam of point n and the normal of its voxel v, in single precision; not-a-number without a plane."""
+    if v < 0 or not has_plane(normal, v):
+        return np.float32(np.nan)
+    square, along = 0.0, 0.0
+    for a in range(3):
+        way = xyz[n, a] - origin[n, a]
+        square += way * way
+        along += way * normal[v, a]
+    return np.float32(np.rad2deg(np.arccos(min(abs(along) / np.sqrt(max(square, 1e-12)), 1.0))))
+
+
 @njit(cache=True, nogil=True)
 def _incidence(xyz: Any, origin: Any, voxel: Any, normal: Any, out: Any) -> None:
     for n in range(len(xyz)):
-        out[n] = np.nan
-        v = voxel[n]
-        if v < 0 or not has_plane(normal, v):
-            continue
-        square, along = 0.0, 0.0
-        for a in range(3):
-            way = xyz[n, a] - origin[n, a]
-            square += way * way
-            along += way * normal[v, a]
-        out[n] = np.rad2deg(np.arccos(min(abs(along) / np.sqrt(max(square, 1e-12)), 1.0)))
+        out[n] = slant_deg(xyz, origin, n, normal, voxel[n])

@@ -34,6 +34,7 @@ from groundproc.estimation.odometry.motion import LIDAR, Motion
 from groundproc.estimation.odometry.spline import Path
 from groundproc.estimation.odometry.track import Track
 from groundproc.machine.aside import aside
+from groundproc.machine.readahead import both
 from groundproc.machine.system import give_back_memory, large_blocks_given_back
 from groundproc.trajectory.covariance import SIZE
 
@@ -217,9 +218,10 @@ def adjust_window(
     batch.log[-1] |= posterior.figures()
     lidar.clusters = Clusters.none()  # what is left to do takes the rows alone, and much more
     give_back_memory()
-    spread = posterior.spread(DRAWS)
-    values, exact = _values(unknowns, posterior, spread, sources.exact)
-    corrections, datum, solved = None, posterior.datum(), posterior.unknowns
+    wanted = [name for name in dict.fromkeys((*sources.exact, *CALIBRATION)) if name in posterior.unknowns.names]
+    spread, covariance, datum = _solved(posterior, wanted)
+    values, exact = _values(unknowns, posterior.unknowns.names, spread, (wanted, covariance), sources.exact)
+    corrections, solved = None, posterior.unknowns
     if sources.lasers_apart:
         corrections = lidar.corrections, lasers.stretched(posterior.weighed(lasers.NAMES), lasers.STRETCH)
     del posterior  # and all rows with it
@@ -265,17 +267,27 @@ def _laid_on(path: Path, tie: Tie) -> Path:
     return path.turned(mat, (tie.position_m - place @ mat.T).mean(axis=0))
 
 
+def _solved(posterior: Posterior, wanted: Sequence[str]) -> tuple[Spread, Array, Array]:
+    """Draws of the errors; meanwhile, by a second thread, the covariance of some globals and that of the datum: all take the same rows."""
+    spread, (covariance, datum) = both(
+        lambda: posterior.spread(DRAWS), lambda: (posterior.covariance(wanted), posterior.datum())
+    )
+    return spread, covariance, datum
+
+
 def _values(
-    unknowns: Unknowns, posterior: Posterior, spread: Spread, exact: tuple[str, ...]
-) -> tuple[dict[str, tuple[Array, Array]], Array | None]:
-    """Globals with their sigmas, and the covariance of those asked for; `unknowns` are those after the last step."""
+    unknowns: Unknowns, names: Mapping[str, slice], spread: Spread, solved: tuple[Sequence[str], Array], exact: Sequence[str]
+) -> tuple[dict[str, tuple[Array, Array]], Array | None]:  # fmt: skip
+    """Globals with their sigmas, and the covariance of those that are asked for exactly.
+
+    `unknowns` are those after the last step; `names` say where they stand in what is spread; `solved` are some of them, those that
+    are asked for first, and their covariance.
+    """
     found = {}
-    names = posterior.unknowns.names
     for name, where in names.items():
         if name.partition(".")[0] not in ("world", "lasers"):
             found[name] = (unknowns.value[name], np.sqrt(spread.variance(operator.itemgetter(where))))
-    wanted = [name for name in dict.fromkeys((*exact, *CALIBRATION)) if name in names]
-    covariance = posterior.covariance(wanted)
+    wanted, covariance = solved
     at = 0
     for name in wanted:
         size = names[name].stop - names[name].start

@@ -16,18 +16,12 @@ def evidence(threads: int, monkeypatch: pytest.MonkeyPatch) -> freespace.Evidenc
     origins_m = np.stack([np.linspace(-3.0, 3.0, count), np.zeros(count), np.zeros(count)], axis=1)
     time_ns = np.arange(count, dtype=np.int64) * 1_000_000
     around = Surroundings()
-    around.add(xyz_m, time_ns, origins_m)
+    voxel = around.add(xyz_m, time_ns, origins_m)
+    np.testing.assert_array_equal(voxel, around.of(xyz_m))
     around.find_planes()
     lookout = freespace.Lookout(around)
     for some in np.array_split(np.arange(count), 3):
-        voxel = around.of(xyz_m[some])
-        lookout.look_along(
-            xyz_m[some],
-            origins_m[some],
-            time_ns[some],
-            around.incidence_deg(xyz_m[some], origins_m[some], voxel),
-            voxel,
-        )
+        lookout.look_along(xyz_m[some], origins_m[some], time_ns[some], voxel[some])
     return lookout.evidence
 
 
