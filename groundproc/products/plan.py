@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from groundproc.files import written_aside
 from groundproc.raster.relief import filled, hillshade
@@ -98,8 +99,10 @@ def _picture(plan: Plan, shown: tuple[int, int], low: Array, high: Array, colour
     pixel_m = float(max(high[0] - low[0], high[1] - low[1])) / PIXELS
     is_plan, corner = shown == (0, 1), list(shown)
     # from above the highest point of a pixel is seen, from the south the nearest
-    order = np.argsort(plan.xyz_m[:, 2] if is_plan else -plan.xyz_m[:, 1], kind="stable")
-    raster = _raster(plan.xyz_m[order][:, corner], plan.value[order], low[corner], high[corner], pixel_m)
+    nearness = plan.xyz_m[:, 2].copy() if is_plan else -plan.xyz_m[:, 1]
+    width, height = np.ceil((high[corner] - low[corner]) / pixel_m).astype(int).tolist()
+    raster = np.full((height, width), np.nan)
+    _see(plan.xyz_m, shown, (low, pixel_m), nearness, plan.value, raster)
     if not (plan.shaded and is_plan):
         picture = np.asarray(colours.to_rgba(raster), np.float64)
     else:
@@ -146,11 +149,14 @@ def _shaded(surface_m: Array, colours: Array, pixel_m: float) -> Array:
     return np.clip(out, 0.0, 1.0)
 
 
-def _raster(place: Array, value: Array, low: Array, high: Array, pixel: float) -> Array:
-    """Value of the last point in each pixel; empty ones are not a number."""
-    width, height = np.ceil((high - low) / pixel).astype(int)
-    column, row = ((place - low) / pixel).astype(int).T
-    inside = (place >= low).all(axis=1) & (column < width) & (row < height)
-    raster = np.full((height, width), np.nan)
-    raster[row[inside], column[inside]] = value[inside]
-    return raster
+@njit(cache=True, nogil=True)
+def _see(xyz: Any, shown: Any, corner: Any, nearness: Any, value: Any, raster: Any) -> None:
+    """Fill in the value of the nearest point in each pixel, of several that are as near the last; empty pixels stay as they are."""
+    (across, up), (low, pixel_m), (rows, columns) = shown, corner, raster.shape
+    nearest = np.full(raster.shape, -np.inf)
+    for i in range(len(xyz)):
+        x, y = (xyz[i, across] - low[across]) / pixel_m, (xyz[i, up] - low[up]) / pixel_m
+        if x >= 0.0 and y >= 0.0 and x < columns and y < rows:
+            column, row = int(x), int(y)
+            if nearness[i] >= nearest[row, column]:
+                nearest[row, column], raster[row, column] = nearness[i], value[i]

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from groundproc.cloud.dimensions import Dimension, in_order
 
@@ -59,9 +60,9 @@ class Shade:
             order = np.asarray(self.kinds)
             rank = np.minimum(np.searchsorted(order, values), len(order) - 1)
             return np.where(order[rank] == values, rank, NO_VALUE).astype(np.uint8)
-        with np.errstate(invalid="ignore"):
-            steps = np.rint((np.asarray(values, np.float64) - self.low) / self.step)
-        return np.where(np.isfinite(steps), np.clip(steps, 0, _STEPS), NO_VALUE).astype(np.uint8)
+        out = np.empty(len(values), np.uint8)
+        _encode(np.ascontiguousarray(values, np.float64), self.low, self.step, out)
+        return out
 
     def plain(self) -> dict[str, Any]:
         """For the page."""
@@ -120,3 +121,11 @@ def _scale(name: str, label: str, unit: str, values: Values) -> Shade:
         step = 1.0  # every value as it is
     shown = np.percentile(known, _SHOWN) if len(known) else np.array([low, high])
     return Shade(name, label, unit, low=low, step=step, shown=(float(shown[0]), float(shown[1])))
+
+
+@njit(cache=True, nogil=True)
+def _encode(values: Any, low: float, step: float, out: Any) -> None:
+    """Fill in the bytes of a scale."""
+    for i in range(len(values)):
+        steps = np.rint((values[i] - low) / step)
+        out[i] = np.uint8(min(max(steps, 0.0), np.float64(_STEPS))) if np.isfinite(steps) else np.uint8(NO_VALUE)

@@ -160,8 +160,7 @@ def rows_of(
     order, first = sorted_by(voxel, voxels)
     del voxel
     seen = Placed(world, clusters.scatter_m2, clusters.count, knot, np.empty(0, np.int32))
-    planes = VoxelPlanes.empty(voxels)
-    find_planes(first, order, seen, voxel_m, planes)
+    planes = _planes_of(first, order, seen, voxel_m)
     keep = _choose(first, order, knot, planes, path.intervals, most)
     leaves = filled_rows(first, order, seen, voxel_m, planes.good, path.intervals, filled)
     flat = len(keep)
@@ -210,6 +209,20 @@ def rows_of(
     return rows
 
 
+def _planes_of(first: Ints, order: Ints, seen: Placed, voxel_m: float) -> VoxelPlanes:
+    """The planes of voxels whose clusters begin at `first` of an order, found half by each core."""
+    voxels = len(first) - 1
+    planes = VoxelPlanes.empty(voxels)
+
+    def find(half: int) -> None:
+        some = slice(half * voxels // 2, (half + 1) * voxels // 2)
+        few = VoxelPlanes(planes.normal[some], planes.mean_m[some], planes.good[some])
+        find_planes(first[some.start : some.stop + 1], order, seen, voxel_m, few)
+
+    at_once(find, 2)
+    return planes
+
+
 def _fill(
     rows: Rows, some: tuple[slice, slice], clusters: Clusters, path: Path, voxels: tuple[Array, Array], variance: Array, voxel_m: float
 ) -> None:  # fmt: skip
@@ -229,7 +242,9 @@ def _fill(
 
 def _of(clusters: Clusters, which: Knots) -> Clusters:
     """Some clusters, by their numbers; without their lasers."""
-    return Clusters(clusters.time_ns[which], clusters.xyz_m[which], clusters.scatter_m2[which], clusters.count[which])
+    # take: a third of the time of indexing where rows are short
+    columns = (clusters.time_ns, clusters.xyz_m, clusters.scatter_m2, clusters.count)
+    return Clusters(*(column.take(which, axis=0) for column in columns))
 
 
 def _instants(clusters: Clusters, which: Knots) -> Clusters:
