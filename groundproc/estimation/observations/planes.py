@@ -243,8 +243,12 @@ def _fill(
 def _of(clusters: Clusters, which: Knots) -> Clusters:
     """Some clusters, by their numbers; without their lasers."""
     # take: a third of the time of indexing where rows are short
-    columns = (clusters.time_ns, clusters.xyz_m, clusters.scatter_m2, clusters.count)
-    return Clusters(*(column.take(which, axis=0) for column in columns))
+    return Clusters(
+        clusters.time_ns.take(which),
+        clusters.xyz_m.take(which, axis=0),
+        clusters.scatter_m2.take(which, axis=0),
+        clusters.count.take(which),
+    )
 
 
 def _instants(clusters: Clusters, which: Knots) -> Clusters:
