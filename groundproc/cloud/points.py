@@ -1,6 +1,6 @@
 """Points: returns placed in the world, and what became of the shots that made none."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
@@ -92,8 +92,16 @@ class Points:
 
     def masked(self, where: npt.NDArray[Any] | slice) -> "Points":
         """Some of the points: a mask, numbers or a slice. What was dropped stays as it is."""
-        columns = {name: values[where] for name, values in self.columns.items()}
-        return replace(self, time_ns=self.time_ns[where], xyz_m=self.xyz_m[where], columns=columns)
+        if isinstance(where, slice):
+            return self._each(lambda values: values[where])
+        # numpy picks rows of coordinates by numbers in a third of the time that it takes by a mask
+        numbers = np.flatnonzero(where) if where.dtype == np.bool_ else where
+        return self._each(lambda values: values.take(numbers, axis=0))
+
+    def _each(self, picked: Callable[[Column], Column]) -> "Points":
+        """The points with something picked of each array."""
+        columns = {name: picked(values) for name, values in self.columns.items()}
+        return replace(self, time_ns=picked(self.time_ns), xyz_m=picked(self.xyz_m), columns=columns)
 
     def with_columns(self, **columns: Column) -> "Points":
         """The points with more columns, or with others in their place."""

@@ -109,12 +109,12 @@ def _map_of(track: Track, motion: Motion, first: int, last: int) -> PlaneMap:
     """The planes of slices `first` to `last`."""
     planes = PlaneMap(track.voxel_m)
     path = track.causal_path(motion, first, last)
+    mats = frames.mat_from_quat(path.quat)
     for clusters in track.clusters[first:last]:
         if not len(clusters):
             continue
         place = np.clip((clusters["time_ns"] - path.start_ns) // STEP_NS, 0, len(path.quat) - 1)
-        mats = frames.mat_from_quat(path.quat[place])
-        world = np.einsum("nij,nj->ni", mats, clusters["xyz"].astype(np.float64)) + path.position_m[place]
+        world = np.einsum("nij,nj->ni", mats[place], clusters["xyz"].astype(np.float64)) + path.position_m[place]
         planes.insert(world, clusters, Odometry.MOST, judged=False)
     planes.judge()
     return planes
