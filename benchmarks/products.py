@@ -116,12 +116,17 @@ def note(text: str) -> None:
 
 
 def process(log: Path, folder: Path, *words: str) -> tuple[float, float, float]:
-    """`swath process` into an empty folder: seconds by the clock, CPU time [s], highest resident memory [GB]."""
+    """`swath process` into an empty folder: seconds by the clock, CPU time [s], highest resident memory [GB].
+
+    As it is installed: modules have their byte code, which the first run leaves beside the sources.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     program = "import sys; from groundproc.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "process", log, "-o", folder, *words]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     peak_kb, began = 0, time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(ROOT)}) as child:
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment) as child:
         while not (ended := os.wait4(child.pid, os.WNOHANG))[0]:
             peak_kb = max(peak_kb, resident_peak_kb(child.pid))
             time.sleep(0.05)
