@@ -4,11 +4,14 @@ Scatter is the sum of w (x - mean)(x - mean)^T over points of weight w, kept as 
 vectors of either sign.
 """
 
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+
+from groundproc.numerics.parts import at_once
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -139,6 +142,14 @@ class VoxelPlanes(NamedTuple):
     def empty(cls, voxels: int) -> "VoxelPlanes":
         """None yet."""
         return cls(np.zeros((voxels, 3)), np.empty((voxels, 3)), np.zeros(voxels, np.bool_))
+
+
+def by_halves(work: Callable[[slice], None], first: Ints) -> None:
+    """Do a work for all voxels, on both cores: those before and after the middle of what they hold, `first` being where each begins."""
+    voxels = len(first) - 1
+    middle = int(np.searchsorted(first, first[-1] // 2))
+    parts = [slice(0, middle), slice(middle, voxels)]
+    at_once(lambda number: work(parts[number]), 2)
 
 
 @njit(cache=True, nogil=True)

@@ -87,14 +87,17 @@ class Noise:
         patches = int(self.patch.max(initial=-1)) + 1
         return patches, 3 * self.follow.shape[0], self.others.shape[0], self.anchors.shape[0]
 
-    def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """One draw of the gradient, shape (unknowns,), and the part of it that is the anchors'."""
+    def numbers(self, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+        """Independent numbers of size one, as many as each source takes: those of a draw."""
         patches, turns, others, anchors = self.sizes
-        anchored = self.anchors.T @ rng.standard_normal(anchors)
-        local = self.gradient(
-            rng.choice([-1.0, 1.0], patches), rng.standard_normal(turns), rng.standard_normal(others), np.zeros(anchors)
-        )
-        return local + anchored, anchored
+        of_anchors = rng.standard_normal(anchors)
+        signs = rng.choice([-1.0, 1.0], patches)
+        return signs, rng.standard_normal(turns), rng.standard_normal(others), of_anchors
+
+    def drawn(self, signs: Array, turns: Array, others: Array, anchors: Array) -> tuple[Array, Array]:
+        """What they make of the gradient, shape (unknowns,), and the part of it that is the anchors'."""
+        anchored = self.anchors.T @ anchors
+        return self.gradient(signs, turns, others, np.zeros(len(anchors))) + anchored, anchored
 
     def gradient(self, signs: Array, turns: Array, others: Array, anchors: Array) -> Array:
         """S times a vector, given in its parts."""

@@ -13,6 +13,7 @@ from groundproc.estimation.adjustment.solve import Problem
 from groundproc.estimation.observations.rows import Unknowns
 from groundproc.estimation.odometry.grid import STEPS
 from groundproc.estimation.odometry.spline import Path
+from groundproc.numerics.parts import at_once
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -112,8 +113,13 @@ class Posterior:
         """So many draws of the error of the solution, noise put through the same solution; and what need not be drawn."""
         rng = np.random.default_rng(seed)
         rights, of_anchors = np.empty((2, self.unknowns.size, count))
-        for i in range(count):
-            rights[:, i], of_anchors[:, i] = self.noise.draw(rng)
+        noise = self.noise
+        numbers = [noise.numbers(rng) for _ in range(count)]
+
+        def draw(number: int) -> None:
+            rights[:, number], of_anchors[:, number] = noise.drawn(*numbers[number])
+
+        at_once(draw, count)
         whole = self.told(self.problem.solve_all(rights, 0.0, ENOUGH_OF_DRAWS)).T
         anchored = self.told(self.problem.coarse.solve(of_anchors)).T
         if self.problem.wide is not None:  # control holds the whole, and the coarse path does not know of it
@@ -155,8 +161,12 @@ class Posterior:
         solved = self.problem.solve_all(rights, 0.0, ENOUGH_OF_COLUMNS)
         # hundreds of thousands of numbers for each global: they are kept in single precision, and multiplied in double
         seen = np.empty((len(places), sum(self.noise.sizes)), np.float32)
-        for i, column in enumerate(np.ascontiguousarray(solved.T)):
-            seen[i] = self.noise.seen(column)
+        columns, noise = np.ascontiguousarray(solved.T), self.noise
+
+        def see(number: int) -> None:
+            seen[number] = noise.seen(columns[number])
+
+        at_once(see, len(columns))
         found = np.zeros((len(places), len(places)))
         for begin in range(0, seen.shape[1], AT_ONCE):
             some = seen[:, begin : begin + AT_ONCE].astype(np.float64)

@@ -12,7 +12,7 @@ from numba import njit
 
 from groundproc.estimation.odometry.matching import FILLED_RETURNS, FILLED_SIGMA_M
 from groundproc.estimation.odometry.voxels import FEWEST_SCATTERED, LEAST_SPREAD_M
-from groundproc.numerics.planes import FEWEST_CLUSTERS, MOST_RETURNS, Placed, add_scatter, flattest_of
+from groundproc.numerics.planes import FEWEST_CLUSTERS, MOST_RETURNS, Placed, add_scatter, by_halves, flattest_of
 from groundproc.numerics.voxelhash import spread
 
 Array = npt.NDArray[np.float64]
@@ -78,7 +78,12 @@ def filled_rows(
     """
     voxels = len(first) - 1
     fillings = Fillings(np.zeros((voxels, 3, 3)), np.zeros((voxels, 3)), np.zeros((voxels, 3)))
-    _find(first, order, placed, taken, fillings)
+
+    def find(some: slice) -> None:
+        part = Fillings(fillings.axes[some], fillings.spread_m2[some], fillings.mean_m[some])
+        _find(first[some.start : some.stop + 1], order, placed, taken[some], part)
+
+    by_halves(find, first)
     found = np.flatnonzero(fillings.spread_m2[:, 0] > 0.0)
     counts = np.zeros(intervals, np.int64)
     _count(found, first, order, placed.knot, counts)

@@ -128,3 +128,14 @@ def test_points_are_sorted_by_their_voxels_and_keep_their_order_inside() -> None
         assert len(set(expected.ravel()[members].tolist())) == 1
         assert (np.diff(members) > 0).all()
     assert sorted(order.tolist()) == list(range(500))
+
+
+@pytest.mark.parametrize("counts", [[], [7], [100, 1, 1], [1, 1, 100], [3, 4, 5, 6]])
+def test_halves_hold_every_voxel_once(counts: list[int]) -> None:
+    first, seen = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), np.zeros(len(counts), np.int64)
+
+    def count(some: slice) -> None:
+        seen[some] += 1
+
+    planes.by_halves(count, first)
+    assert (seen == 1).all()
