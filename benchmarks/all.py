@@ -11,6 +11,7 @@ import platform
 import subprocess
 import sys
 import textwrap
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -85,8 +86,9 @@ def versions() -> str:
 
 
 def table(rows: dict[str, Any]) -> str:
-    """A table of names and values; one line for each name where every value is an object of its own."""
+    """A table of names and values; one line for each name where every value is an object of its own, and one for each in that again."""
     if rows and all(isinstance(value, dict) for value in rows.values()):
+        rows = {name: value for row in rows.items() for name, value in _with_inner(*row)}
         columns = list(dict.fromkeys(key for value in rows.values() for key in value))
         lines = ["| |" + "".join(f" `{key}` |" for key in columns), "|---" * (len(columns) + 1) + "|"]
         for name, value in rows.items():
@@ -94,6 +96,11 @@ def table(rows: dict[str, Any]) -> str:
         return "\n".join(lines)
     lines = ["| figure | value |", "|---|---|"]
     return "\n".join([*lines, *(f"| `{name}` | {show(value)} |" for name, value in rows.items())])
+
+
+def _with_inner(name: str, row: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    yield name, {key: value for key, value in row.items() if not isinstance(value, dict)}
+    yield from ((f"{name}, {key}", value) for key, value in row.items() if isinstance(value, dict))
 
 
 def show(value: Any) -> str:
