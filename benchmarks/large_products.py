@@ -35,7 +35,7 @@ RASTERS: Final[dict[str, list[str]]] = {
     "sky-view": ["sky-view"],
     "sigma": ["sigma"],
 }
-SWATH: Final = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+SWATH: Final = "import sys; from groundproc.cli import main; sys.exit(main())"
 
 
 def main() -> int:

@@ -115,18 +115,20 @@ def note(text: str) -> None:
     print(f"note: {text}", flush=True)
 
 
-def process(log: Path, folder: Path, *words: str) -> tuple[float, float, float]:
-    """`swath process` into an empty folder: seconds by the clock, CPU time [s], highest resident memory [GB].
+def as_installed() -> dict[str, str]:
+    """The environment of the command: modules have their byte code, which the first run leaves beside the sources."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    return environment
 
-    As it is installed: modules have their byte code, which the first run leaves beside the sources.
-    """
+
+def process(log: Path, folder: Path, *words: str) -> tuple[float, float, float]:
+    """`swath process` into an empty folder: seconds by the clock, CPU time [s], highest resident memory [GB]."""
     shutil.rmtree(folder, ignore_errors=True)
     program = "import sys; from groundproc.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "process", log, "-o", folder, *words]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     peak_kb, began = 0, time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment) as child:
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=as_installed()) as child:
         while not (ended := os.wait4(child.pid, os.WNOHANG))[0]:
             peak_kb = max(peak_kb, resident_peak_kb(child.pid))
             time.sleep(0.05)
@@ -247,7 +249,7 @@ def workers(bench: Bench) -> Figures:
             program = "import sys; from groundproc.cli import main; sys.exit(main())"
             began = time.perf_counter()
             command = [sys.executable, "-c", program, "batch", file, "--scheduler", address]
-            done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
+            done = subprocess.run(command, stdout=subprocess.DEVNULL, env=as_installed(), check=False)
             took.append(time.perf_counter() - began)
             if done.returncode not in GOOD:
                 raise SystemExit(f"swath batch: exit code {done.returncode}")
@@ -283,7 +285,9 @@ class Cluster:
 
     def _start(self, name: str, *words: str | Path) -> None:
         command = [sys.executable, "-W", "ignore", "-m", f"distributed.cli.{name}", *words]
-        self._running.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        self._running.append(
+            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=as_installed())
+        )
 
 
 def peak(bench: Bench) -> Figures:

@@ -107,7 +107,7 @@ def main() -> int:
         return 2
     with tempfile.TemporaryDirectory(prefix="bench-report-") as name:
         folder = Path(name)
-        swath = [sys.executable, "-c", "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"]
+        swath = [sys.executable, "-c", "import sys; from groundproc.cli import main; sys.exit(main())"]
         flight, out = folder / "flight", folder / "out"
         subprocess.run(
             [*swath, "simulate", "--scene", "panels", "--duration", "6", "--seed", "1", "-o", flight], check=True

@@ -18,7 +18,8 @@ _PLACE: Final = 64
 def aside(*arrays: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], ...]:
     """The same arrays in one file, which goes with the last of them; where a file has no room, they themselves.
 
-    They are arrays like others. What of them is read is in memory until `system.let_go`.
+    They are arrays like others, of numbers. What of them is read is in memory until `system.let_go`. Where the folder for temporary files
+    lies in memory (tmpfs), nothing is won but in the figures of the process: TMPDIR names another.
     """
     places = np.cumsum([0, *(-(-each.nbytes // _PLACE) * _PLACE for each in arrays)]).tolist()
     if places[-1] < _SMALL:

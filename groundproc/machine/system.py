@@ -9,6 +9,7 @@ import mmap
 import os
 import shutil
 import sys
+import threading
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ LIMITED: Final = os.name == "posix" and importlib.util.find_spec("resource") is 
 _PUNCH_HOLE_KEEP_SIZE: Final = 3
 """Of Linux' fallocate."""
 _mapped: "Final[weakref.WeakSet[mmap.mmap]]" = weakref.WeakSet()
+_mapping: Final = threading.Lock()
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
 """Of glibc's mallopt."""
@@ -59,15 +61,19 @@ def give_back_memory() -> None:
 
 def read_now_and_then(room: mmap.mmap) -> mmap.mmap:
     """A file mapped into memory as one of which `let_go` leaves nothing there until it is read again."""
-    _mapped.add(room)
+    with _mapping:
+        _mapped.add(room)
     return room
 
 
 def let_go() -> None:
     """Have nothing of such files in memory, where the system can do so."""
     if hasattr(mmap, "MADV_DONTNEED"):
-        for room in list(_mapped):
-            room.madvise(mmap.MADV_DONTNEED)
+        with _mapping:
+            rooms = list(_mapped)
+        for room in rooms:
+            with contextlib.suppress(OSError):  # pages that are locked in memory stay there
+                room.madvise(mmap.MADV_DONTNEED)
 
 
 @contextlib.contextmanager

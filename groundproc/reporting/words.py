@@ -85,7 +85,7 @@ def facts(quality: Quality, density: float | None, area_m2: float | None) -> Htm
         ("Density, median", "" if density is None else f"{density:.0f} /m²"),
         ("Position in plan, one sigma", length(math.hypot(east, north))),
         ("Height, one sigma", length(up)),
-        ("Level, one sigma", f"{max(level):.2f}°" if math.isfinite(max(level)) else ""),
+        ("Level, one sigma", f"{max(level):.2f}°" if all(map(math.isfinite, level)) else ""),
         ("Heading, one sigma", f"{heading:.2f}°" if math.isfinite(heading) else ""),
         ("Clocks, one sigma", f"{sync['sigma_s'] * 1e3:.2f} ms"),
     ]

@@ -74,9 +74,9 @@ def _trajectory(quality: Figures) -> Iterator[Reason]:
 
 def _position(sigma_m: Sequence[float], what: str, hopeless: bool) -> Reason | None:
     """What a sigma of east, north and up says of the positions."""
-    plan_m, height_m = max(sigma_m[:2]), sigma_m[2]
-    # a sigma that nobody stated is not a number, and no reason
-    if not (plan_m > POSITION_M[0] or height_m > POSITION_M[1]):
+    east_m, north_m, height_m = _stated(sigma_m)
+    plan_m = max(east_m, north_m)
+    if plan_m <= POSITION_M[0] and height_m <= POSITION_M[1]:
         return None
     grade = BAD if hopeless and max(plan_m, height_m) > POSITION_HOPELESS_M else DOUBTFUL
     return Reason(
@@ -87,20 +87,26 @@ def _position(sigma_m: Sequence[float], what: str, hopeless: bool) -> Reason | N
     )
 
 
+def _stated(sigmas: Sequence[float]) -> list[float]:
+    """A sigma that nobody stated is not a number, and no reason: 0 takes its place."""
+    return [0.0 if math.isnan(sigma) else sigma for sigma in sigmas]
+
+
 def _attitude(quality: Figures) -> Iterator[Reason]:
     found = quality["trajectory"].get("median_sigma_attitude_deg")
     if not found:
         return
-    level_deg, heading_deg = max(found[:2]), found[2]
-    # a sigma that nobody stated is not a number, and no reason
+    roll_deg, pitch_deg, heading_deg = _stated(found)
+    level_deg = max(roll_deg, pitch_deg)
     if level_deg > LEVEL_DEG or heading_deg > HEADING_DEG:
         off_m = USUAL_RANGE_M * math.radians(max(level_deg, heading_deg))
+        known = {"level": level_deg, "heading": heading_deg}
+        said = " and ".join(f"{name} to {value:.1f} deg" for name, value in known.items() if value)
         yield Reason(
             DOUBTFUL,
             "attitude",
-            f"the lidar's level is known to {level_deg:.1f} deg and its heading to {heading_deg:.1f} deg (one sigma), which "
-            f"moves points {USUAL_RANGE_M:.0f} m away by up to {off_m:.1f} m, expected {LEVEL_DEG:g} and {HEADING_DEG:g} deg "
-            f"or better{_remedy(quality)}",
+            f"the lidar's attitude is known in {said} only (one sigma), which moves points {USUAL_RANGE_M:.0f} m away by up "
+            f"to {off_m:.1f} m, expected {LEVEL_DEG:g} and {HEADING_DEG:g} deg or better{_remedy(quality)}",
         )
 
 

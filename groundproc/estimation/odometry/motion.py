@@ -241,10 +241,14 @@ def on_grid(time_ns: Times, values: Array, start_ns: int, steps: int) -> tuple[A
     edges = np.arange(steps + 1) * (STEP_NS * 1e-9)
     place = np.clip(np.searchsorted(seconds, edges, side="right") - 1, 0, len(seconds) - 2)
     gap = seconds[place + 1] - seconds[place]
-    if len(seconds) > 3 and (len(seconds) - 1) / np.ptp(seconds) < CUBIC_BELOW_HZ:
+    spacing = np.diff(seconds)
+    usual = spacing[
+        spacing * 1e9 <= LONGEST_SAMPLE_GAP_NS
+    ]  # a hole in a part of a flight makes no slow unit of a fast one
+    if len(seconds) > 3 and len(usual) < CUBIC_BELOW_HZ * usual.sum():
         total = CubicSpline(seconds, values, axis=0).antiderivative()(np.clip(edges, seconds[0], seconds[-1]))
     else:
-        rise = 0.5 * (values[1:] + values[:-1]) * np.diff(seconds)[:, None]
+        rise = 0.5 * (values[1:] + values[:-1]) * spacing[:, None]
         area = np.concatenate([np.zeros((1, 3)), np.cumsum(rise, axis=0)])
         since = np.clip(edges - seconds[place], 0.0, gap)[:, None]
         slope = (values[place + 1] - values[place]) / gap[:, None]
