@@ -1,13 +1,13 @@
 """Parts of a cloud that is being written, kept as they are packed: who would read them from the file need not have them unpacked."""
 
 import itertools
-import tempfile
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from groundproc.machine.scratch import Scratch
 
 Records = npt.NDArray[np.void]
 Parts = Sequence[tuple[int, int]]
@@ -29,30 +29,25 @@ class SetAside:
         self._wanted = wanted
         self._parts: list[tuple[int, int]] | None = None
         self._seen, self._whole = 0, 0
-        self._file: Any = None
+        self._file: Scratch | None = None
 
     def see(self, records: Records) -> None:
         """Keep what is wanted of the next records of the cloud, shape (n,)."""
         try:
             if self._parts is None:
                 self._parts = list(self._wanted())
-                self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 (open as long as this lives)
-                weakref.finalize(self, self._file.close)
+                self._file = Scratch()
             begin, self._seen = self._seen, self._seen + len(records)
             for first, count in self._parts[self._whole :]:
                 if first >= self._seen:
                     break
-                self._write(records[max(first - begin, 0) : first + count - begin])
+                assert self._file is not None
+                self._file.write(records[max(first - begin, 0) : first + count - begin])
                 self._whole += first + count <= self._seen
         except OSError:
             self._parts, self._whole = [], 0
             if self._file is not None:
                 self._file.close()  # at once: the cloud needs the room
-
-    def _write(self, records: Records) -> None:
-        left = memoryview(records.view(np.uint8).data)
-        while len(left):
-            left = left[self._file.write(left) :]
 
     def has(self, parts: Parts) -> bool:
         """Whether these are the parts that were kept, and all of them whole."""
@@ -67,13 +62,7 @@ class SetAside:
             The file cannot be read.
         """
         assert self._parts is not None
+        assert self._file is not None
         before = sum(count for _, count in itertools.takewhile(lambda each: each != part, self._parts))
-        out = np.empty(part[1], dtype)
         self._file.seek(before * dtype.itemsize)
-        left = memoryview(out.view(np.uint8).data)
-        while len(left):
-            done = self._file.readinto(left)
-            if not done:
-                raise OSError(f"{len(left)} bytes are missing of points that were set aside")
-            left = left[done:]
-        return out
+        return self._file.read(part[1], dtype)

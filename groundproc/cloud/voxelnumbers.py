@@ -1,15 +1,14 @@
 """The voxels of a stretch's points, kept from when they are found: who goes through the stretch again need not look them up again."""
 
-import tempfile
-import weakref
+import contextlib
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from groundproc.cloud.points import Points
 from groundproc.cloud.surroundings import Surroundings
+from groundproc.machine.scratch import Scratch
 
 Ints = npt.NDArray[np.int32]
 
@@ -27,21 +26,16 @@ class VoxelNumbers:
 
     def __init__(self, around: Surroundings) -> None:
         self._around = around
-        self._file: Any = None
-        try:
-            self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 (open as long as this lives)
-            weakref.finalize(self, self._file.close)
-        except OSError:
-            pass
+        self._file: Scratch | None = None
+        with contextlib.suppress(OSError):
+            self._file = Scratch()
 
     def keep(self, voxel: Ints) -> None:
         """Keep those of the next points, shape (n,)."""
         if self._file is None:
             return
         try:
-            left = voxel.view(np.uint8).data
-            while len(left):
-                left = left[self._file.write(left) :]
+            self._file.write(voxel)
         except OSError:
             self._file.close()  # at once: products need the room
             self._file = None
@@ -57,11 +51,4 @@ class VoxelNumbers:
     def _next(self, points: Points) -> Ints:
         if self._file is None:
             return self._around.of(points.xyz_m)
-        voxel = np.empty(len(points), np.int32)
-        left = voxel.view(np.uint8).data
-        while len(left):
-            done = self._file.readinto(left)
-            if not done:
-                raise OSError(f"{len(left)} bytes are missing of the voxels that were kept")
-            left = left[done:]
-        return voxel
+        return self._file.read(len(points), np.int32)
