@@ -2,11 +2,12 @@
 const VERTEX = `#version 300 es
   in vec3 place; in float value; in vec3 paint;
   uniform mat4 view; uniform int mode; uniform vec2 span; uniform sampler2D palette;
-  uniform vec4 slab, ends; uniform float grain, perDepth, least, most;
+  uniform vec4 slab, ends; uniform vec3 centre; uniform float grains[8], perDepth, least, most;
   out vec3 tint;
   void main() {
     gl_Position = view * vec4(place, 1.);
-    gl_PointSize = clamp(grain * (perDepth > 0. ? perDepth / gl_Position.w : -perDepth), least, most);
+    ivec3 side = ivec3(greaterThanEqual(place, centre));
+    gl_PointSize = clamp(grains[side.x + 2 * side.y + 4 * side.z] * (perDepth > 0. ? perDepth / gl_Position.w : -perDepth), least, most);
     vec4 colour = vec4(paint, 1.);
     if (mode == 0) { float t = clamp((place.z - span.x) / (span.y - span.x), 0., 1.); colour = texelFetch(palette, ivec2(int(t * 255. + .5), 0), 0); }
     else if (mode == 1) {
@@ -68,9 +69,10 @@ class Renderer {
     const places = {};
     return {made, at: name => name in places ? places[name] : places[name] = gl.getUniformLocation(made, name)};
   }
-  // A chunk: places (Float32Array, from the scene's origin), bytes by attribute, how far its points are apart.
-  put(id, places, bytes) {
-    const gl = this.gl, chunk = {id, places, bytes, count: places.length / 3, shown: true, array: gl.createVertexArray(), buffers: {}, colour: null};
+  // A chunk: places (Float32Array, from the scene's origin), bytes by attribute. Its points may be drawn with a width of their own in each
+  // eighth around its centre: grains, in metres, by x + 2 y + 4 z.
+  put(id, places, bytes, centre = [0, 0, 0]) {
+    const gl = this.gl, chunk = {id, places, bytes, centre, grains: null, count: places.length / 3, shown: true, array: gl.createVertexArray(), buffers: {}, colour: null};
     gl.bindVertexArray(chunk.array);
     chunk.buffers.place = this.buffer(0, places, 3, gl.FLOAT, false);
     gl.bindVertexArray(null);
@@ -140,12 +142,14 @@ class Renderer {
     gl.uniform4f(at("slab"), ...slab.plane); gl.uniform4f(at("ends"), ...slab.ends);
     const perMetre = target.h / (2 * Math.tan(FOV / 2));
     gl.uniform1f(at("perDepth"), view.ortho ? -target.h / (view.perPixel * view.height) : perMetre);
-    gl.uniform1f(at("grain"), look.grain * look.size);
     gl.uniform1f(at("least"), 1.6 * target.ratio * Math.sqrt(look.size)); gl.uniform1f(at("most"), 14 * target.ratio);
+    const same = new Float32Array(8).fill(look.grain * look.size);
     let count = 0;
     for (const chunk of this.chunks.values()) {
       if (!chunk.shown || (some && !some(chunk))) continue;
       this.colour(chunk, look.name);
+      gl.uniform3f(at("centre"), ...chunk.centre);
+      gl.uniform1fv(at("grains"), chunk.grains ? chunk.grains.map(each => each * look.size) : same);
       gl.bindVertexArray(chunk.array);
       gl.drawArrays(gl.POINTS, 0, chunk.count);
       count += chunk.count;

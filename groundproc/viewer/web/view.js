@@ -1,6 +1,8 @@
 // A cloud of any size: nodes of its octree are asked for as they are looked at, the largest in the picture first.
 const scene = JSON.parse(document.getElementById("scene").textContent);
 const SMALLEST = 110, AT_ONCE = 4;  // pixels of a node that is worth its points; requests
+const WIDTH = 2.1;  // of a point, in distances between the points of its level: discs at random close a surface at about twice of them
+const childOf = (node, k) => `${node.level + 1}-${2 * node.x + (k & 1)}-${2 * node.y + (k >> 1 & 1)}-${2 * node.z + (k >> 2)}`;
 class Octree {
   constructor(viewer) {
     this.viewer = viewer; this.nodes = new Map(); this.asked = 0; this.lost = 0; this.budget = 2e6; this.waiting = false;
@@ -34,7 +36,7 @@ class Octree {
   }
   choose() {
     const {viewer} = this, view = viewer.view, queue = [], wanted = new Set(), missing = [];
-    let points = 0, finest = 0;
+    let points = 0;
     const offer = key => { const node = this.nodes.get(key); if (!node) return; const size = this.pixels(view, node); if (size > 0 && (node.level === 0 || size > SMALLEST)) queue.push([size, key, node]); };
     offer("0-0-0-0");
     while (queue.length && points < this.budget) {
@@ -43,8 +45,8 @@ class Octree {
       const [, key, node] = queue.splice(best, 1)[0];
       points += node.count; wanted.add(key);
       if (node.state === "away") missing.push(key);
-      else if (node.chunk) { node.seen = ++this.tick || (this.tick = 1); finest = Math.max(finest, node.level); }
-      for (let k = 0; k < 8; k++) offer(`${node.level + 1}-${2 * node.x + (k & 1)}-${2 * node.y + (k >> 1 & 1)}-${2 * node.z + (k >> 2)}`);
+      else if (node.chunk) node.seen = ++this.tick || (this.tick = 1);
+      for (let k = 0; k < 8; k++) offer(childOf(node, k));
     }
     let shown = 0, loaded = 0;
     for (const [key, node] of this.nodes) if (node.chunk) {
@@ -55,11 +57,21 @@ class Octree {
       const old = [...this.nodes.values()].filter(node => node.chunk && !node.chunk.shown).sort((a, b) => a.seen - b.seen);
       for (const node of old) { if (loaded <= 1.5 * this.budget) break; viewer.renderer.drop(node.chunk.id); node.chunk = null; node.state = "away"; loaded -= node.count; }
     }
-    viewer.look.grain = 1.5 * scene.spacing / 2 ** Math.max(finest - 0.5, 0);
+    if (wanted.has("0-0-0-0")) this.spread(this.nodes.get("0-0-0-0"), wanted);
     viewer.dirty = true;
     this.missing = missing; this.shown = shown;
     this.tell();
     while (this.asked < AT_ONCE && this.missing.length) this.load(this.missing.shift());
+  }
+  // Points are as wide as they are apart, so that surfaces close where no finer nodes are shown: in each eighth as the finest there.
+  spread(node, wanted) {
+    const own = WIDTH * scene.spacing / 2 ** node.level, grains = new Float32Array(8).fill(own);
+    for (let k = 0; k < 8; k++) {
+      const key = childOf(node, k), child = this.nodes.get(key);
+      if (wanted.has(key) && child.state === "here") grains[k] = this.spread(child, wanted);
+    }
+    if (node.chunk) node.chunk.grains = grains;
+    return Math.min(...grains);
   }
   async load(key) {
     const node = this.nodes.get(key);
@@ -69,7 +81,7 @@ class Octree {
       if (!answer.ok) throw new Error((await answer.text()).trim());
       const raw = await answer.arrayBuffer(), places = new Float32Array(raw, 0, 3 * node.count), bytes = {};
       scene.shades.forEach((shade, k) => { bytes[shade.name] = new Uint8Array(raw, (12 + k) * node.count, node.count).slice(); });
-      node.chunk = this.viewer.renderer.put(key, places, bytes);
+      node.chunk = this.viewer.renderer.put(key, places, bytes, node.centre);
       node.chunk.first = node.level <= 2;
       if (this.onloaded) this.onloaded(node.chunk);
       node.state = "here";

@@ -19,7 +19,7 @@ from groundproc.cli import main
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
 from groundproc.geodesy import projected_crs
-from tests.groundproc.viewer.conftest import ground
+from tests.groundproc.viewer.conftest import ORIGIN_M, ground
 
 Clouds = Callable[[int], tuple[Path, Path]]
 needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
@@ -87,6 +87,34 @@ def test_what_is_near_is_shown_in_full_and_what_is_far_is_not(tab: Page, clouds:
         assert tab.run("swathViewer.drawn") == 0
         assert 0 < near < POINTS
         assert tab.said == []
+
+
+@needs_browser
+def test_surfaces_are_closed_wherever_finer_points_are_not_shown(tab: Page, clouds: Clouds) -> None:
+    with viewed(clouds(POINTS)[1]) as (address, _):
+        tab.open(address)
+        settled(tab)
+        tab.run(
+            "swathViewer.look.dome = false; swathViewer.camera.above(); swathViewer.camera.distance = 60; swathViewer.turned()"
+        )
+        origin = np.array(tab.run("swathViewer.scene.origin"))
+        tab.run("swathViewer.octree.budget = 60000; swathViewer.octree.choose()")
+        settled(tab)
+        shown = tab.run("[...swathViewer.renderer.chunks.values()].filter(c => c.shown).map(c => [...c.grains])")
+        # some parts of the picture are a level or more finer than others
+        assert np.max(shown) > 1.9 * np.min(shown)
+        # ground by itself: beside the house, from corner to corner of the denser part and beyond
+        ends = [ORIGIN_M + (3.0, 3.0, 0.0) - origin, ORIGIN_M + (42.0, 57.0, 0.0) - origin]
+        (x0, y0, _), (x1, y1, _) = (
+            tab.run(f"swathViewer.project(swathViewer.view, {json.dumps(each.tolist())})") for each in ends
+        )
+        part = tab.pixels()[
+            int(max(min(y0, y1), 0)) : int(min(max(y0, y1), 650)), int(max(min(x0, x1), 270)) : int(max(x0, x1))
+        ]
+        assert part.size > 3 * 40_000
+        sky = np.array(tab.run("swathViewer.renderer.theme.below")) * 255
+        bare = (abs(part - sky).max(axis=2) < 6).mean()
+        assert bare < 0.02, bare
 
 
 @needs_browser
