@@ -104,7 +104,7 @@ def test_surfaces_are_closed_wherever_finer_points_are_not_shown(tab: Page, clou
         # some parts of the picture are a level or more finer than others
         assert np.max(shown) > 1.9 * np.min(shown)
         # ground by itself: beside the house, from corner to corner of the denser part and beyond
-        ends = [ORIGIN_M + (3.0, 3.0, 0.0) - origin, ORIGIN_M + (42.0, 57.0, 0.0) - origin]
+        ends = [ORIGIN_M - origin + np.array(corner) for corner in ((3.0, 3.0, 0.0), (42.0, 57.0, 0.0))]
         (x0, y0, _), (x1, y1, _) = (
             tab.run(f"swathViewer.project(swathViewer.view, {json.dumps(each.tolist())})") for each in ends
         )
