@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -30,8 +31,9 @@ _PROGRAM: Final = "import sys; from groundproc.cli import main; sys.exit(main(sy
 _PR_SET_PDEATHSIG: Final = 1
 """prctl(2): a signal for the child when its parent dies."""
 _THREADS: Final = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
-GOOD_CODES: Final = (0, 3)
-"""Exit codes of a flight whose products are there."""
+_MISSING: Final = "missing"
+_GOOD_LINE: Final = Verdict(()).line()
+"""It says no more than the outcome does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +44,9 @@ class Outcome:
     ----------
     name, output : str
     exit_code : int
-        Of `swath process`: 0 good, 3 doubtful, else there are no products.
+        Of `swath process`: 0 good, 3 doubtful, else bad or failed.
     verdict : str
-        "good", "doubtful", "bad", or "failed".
+        "good", "doubtful", "bad", or "failed": there are no products.
     seconds : float
     points : int
     said : tuple of str
@@ -63,7 +65,36 @@ class Outcome:
     skipped: bool = False
 
 
-def run_flight(job: Job, threads: int | None = None) -> Outcome:
+class Running:
+    """The processes of flights that are under way, so that whoever waits for their threads can end them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._processes: set[subprocess.Popen[str]] = set()
+        self._over = False
+
+    @contextlib.contextmanager
+    def holds(self, process: "subprocess.Popen[str]") -> Iterator[None]:
+        """For the time of a flight; one that begins after the end is ended at once."""
+        with self._lock:
+            self._processes.add(process)
+            if self._over:
+                process.terminate()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._processes.discard(process)
+
+    def end(self) -> None:
+        """Terminate them: each removes what is half-written. Done more than once, it does no harm."""
+        with self._lock:
+            self._over = True
+            for process in self._processes:
+                process.terminate()
+
+
+def run_flight(job: Job, threads: int | None = None, running: Running | None = None) -> Outcome:
     """Process a flight; whatever goes wrong is in the outcome.
 
     Parameters
@@ -71,11 +102,13 @@ def run_flight(job: Job, threads: int | None = None) -> Outcome:
     job : Job
     threads : int, optional
         Cores that it may use. Default: all.
+    running : Running, optional
+        Where its process is entered.
     """
     began = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="swath-batch-") as scratch:
-            code, quality, said, skipped = _run(job, Path(scratch), threads)
+            code, quality, said, skipped = _run(job, Path(scratch), threads, running or Running())
     except SwathError as error:
         code, quality, said, skipped = error.exit_code, {}, (f"swath: {error}",), False
     except OSError as error:  # of the scratch folder: a full disk
@@ -85,13 +118,15 @@ def run_flight(job: Job, threads: int | None = None) -> Outcome:
             (f"swath: {error.filename or tempfile.gettempdir()}: {error.strerror}",),
             False,
         )
-    verdict = Verdict.from_mapping(quality).grade if code in GOOD_CODES and quality else None
+    verdict = Verdict.from_mapping(quality).grade if quality else None
     points = int(quality.get("points", {}).get("written", 0))
     took_s = time.monotonic() - began
     return Outcome(job.name, job.output, code, verdict or "failed", took_s, points, said, skipped)
 
 
-def _run(job: Job, scratch: Path, threads: int | None) -> tuple[int, dict[str, Any], tuple[str, ...], bool]:
+def _run(
+    job: Job, scratch: Path, threads: int | None, running: Running
+) -> tuple[int, dict[str, Any], tuple[str, ...], bool]:
     """Exit code, quality.json, what was said, and whether nothing was to be done."""
     remote = places.is_remote(job.output)
     key = _key(job) if remote else ""
@@ -104,12 +139,15 @@ def _run(job: Job, scratch: Path, threads: int | None) -> tuple[int, dict[str, A
     survey.write_text(_fetched_settings(job.settings, scratch / "files"), encoding="utf-8")
     folder = scratch / "products" if remote else Path(job.output)
     words = ["process", *map(str, logs), "-o", str(folder), "--config", str(survey), "--json"]
-    code, out, said = _child([*words, *(["--force"] if job.force else [])], threads)
+    before = _state(folder / DONE)
+    code, out, said = _child([*words, *(["--force"] if job.force else [])], threads, running)
     quality = _quality(out)
-    if code in GOOD_CODES and remote:
+    if quality and remote:  # those of a bad flight too: its report says why
         (folder / _KEY).write_text(json.dumps({"key": key, "exit_code": code}) + "\n", encoding="utf-8")
         places.deliver(folder, job.output, DONE)
-    return code, quality, said, False
+    # the last that is made, and made anew whenever anything is
+    skipped = bool(quality) and before != _MISSING and _state(folder / DONE) == before
+    return code, quality, tuple(line for line in said if line != _GOOD_LINE), skipped
 
 
 def _numbered(folder: Path, number: int) -> Path:
@@ -128,7 +166,7 @@ def _fetched_settings(settings: str, folder: Path) -> str:
     return config.dump(survey)
 
 
-def _child(words: list[str], threads: int | None) -> tuple[int, str, tuple[str, ...]]:
+def _child(words: list[str], threads: int | None, running: Running) -> tuple[int, str, tuple[str, ...]]:
     """Run `swath`; exit code, standard output, and the lines of standard error."""
     few = dict.fromkeys(_THREADS, str(threads)) if threads else {}
     with (
@@ -144,6 +182,7 @@ def _child(words: list[str], threads: int | None) -> tuple[int, str, tuple[str, 
             preexec_fn=_die_with_parent if sys.platform == "linux" else None,
         ) as process,
         _ended(process),
+        running.holds(process),
     ):
         out, err = process.communicate()
     code = process.returncode
@@ -188,7 +227,7 @@ def _state(path: Path) -> str:
     try:
         found = path.stat()
     except OSError:
-        return "missing"
+        return _MISSING
     return f"{found.st_size} {found.st_mtime_ns}"
 
 

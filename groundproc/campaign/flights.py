@@ -11,7 +11,7 @@ from flightlog.errors import ConfigError
 from groundproc.campaign.places import beside
 from groundproc.survey import FILES, Survey
 
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_NAME: Final = re.compile(r"[^\W_][\w.-]*")
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
 from flightlog.errors import SourceError, UsageError
-from groundproc.campaign.flight import Outcome, run_flight
+from groundproc.campaign.flight import Outcome, Running, run_flight
 from groundproc.campaign.flights import Job
 
 
@@ -31,14 +31,16 @@ def outcomes(jobs: Sequence[Job], scheduler: str | None, workers: int) -> Iterat
 def _here(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     cores = os.cpu_count() or 1
     threads = None if workers == 1 else max(1, cores // workers)
+    processes = Running()
     with ThreadPoolExecutor(workers) as pool:
-        running = [pool.submit(run_flight, job, threads) for job in jobs]
+        running = [pool.submit(run_flight, job, threads, processes) for job in jobs]
         try:
             for each in as_completed(running):
                 yield each.result()
-        except BaseException:
+        except BaseException:  # raised again: the pool waits for its threads, and these for their processes
             for each in running:
                 each.cancel()
+            processes.end()
             raise
 
 

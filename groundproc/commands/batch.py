@@ -46,6 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
     expect_text(arguments.flights, "a list of flights (YAML)")
     jobs = load_jobs(arguments.flights, arguments.force)
     if arguments.dry_run:
+        for job in jobs:
+            _tell_missing(job)
         print(json.dumps([asdict(job) for job in jobs], indent=2) if arguments.json else _planned(jobs))
         return 0
     workers = count(arguments.workers, "--workers") if arguments.workers else 1
@@ -67,6 +69,16 @@ def _planned(jobs: Sequence[Job]) -> str:
     return "\n".join(f"{job.name}: {', '.join(job.logs)} -> {job.output}" for job in jobs)
 
 
+def _tell_missing(job: Job) -> None:
+    """Say before the night what would fail in it; what lies elsewhere is not asked for."""
+    from groundproc.campaign.places import is_remote
+    from groundproc.commands.inputs import like
+
+    for log in job.logs:
+        if not is_remote(log) and not Path(log).exists():
+            print(f"swath: warning: {job.name}: {log}: no such file{like(Path(log))}", file=sys.stderr)
+
+
 def _line(outcome: Outcome) -> str:
     state = "up to date" if outcome.skipped else f"{outcome.seconds:.0f} s"
     return f"{outcome.name}: {outcome.verdict}, {outcome.points:,} points, {state}"
@@ -81,10 +93,11 @@ def _show(found: Sequence[Outcome]) -> None:
         [[each.name, each.verdict, f"{each.points:,}", f"{each.seconds:.0f}", each.output] for each in found],
     )
     failed = sum(each.verdict == "failed" for each in found)
-    print(f"{len(found)} flights, {failed} failed, {sum(each.points for each in found):,} points")
+    flights = f"{len(found)} flight{'s' * (len(found) != 1)}"
+    print(f"{flights}, {failed} failed, {sum(each.points for each in found):,} points")
 
 
 def _exit_code(found: Sequence[Outcome]) -> int:
-    """0 where all are good, 3 where one is doubtful, 1 where one failed."""
+    """0 where all are good, 3 where one is doubtful, 1 where one is bad or failed."""
     codes = {each.exit_code for each in found}
     return 0 if codes <= {0} else 3 if codes <= {0, 3} else 1

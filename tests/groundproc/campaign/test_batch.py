@@ -203,3 +203,74 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(
         file = campaign(tmp_path / "flights.yaml", "out", [{"name": "a", "logs": [str(logs / "a.mcap")]}])
         assert main(["batch", str(file), "--scheduler", address]) == 1
     assert "no Dask scheduler answers there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_who_ends_a_campaign_ends_its_flights(tmp_path: Path, logs: Path, workers: str) -> None:
+    """By its process alone, as `kill` and service managers do: a terminal's Ctrl-C reaches the flights anyway."""
+    flights = [{"name": name, "logs": [str(logs / f"{name}.mcap")]} for name in "ab"]
+    file = campaign(tmp_path / "flights.yaml", "out", flights)
+    endless = "import time; time.sleep(600)"
+    code = (
+        f"import sys; from groundproc.campaign import flight; flight._PROGRAM = {endless!r};"
+        " from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    words = [sys.executable, "-c", code, "batch", str(file), "--workers", workers]
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        parent, children = psutil.Process(process.pid), list[psutil.Process]()
+        deadline = time.monotonic() + 120.0
+        while len(children) < int(workers) and time.monotonic() < deadline:
+            children = [child for child in parent.children() if endless in child.cmdline()]
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 143
+        assert process.stderr is not None
+        assert "Traceback" not in process.stderr.read()
+    assert len(children) == int(workers)
+    assert not any(child.is_running() for child in children)
+
+
+def test_what_is_up_to_date_is_said_to_be(tmp_path: Path, logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "nord-ö").mkdir()
+    flights = [{"name": "flug-ä", "logs": [str(logs / "a.mcap")]}]
+    file = campaign(tmp_path / "nord-ö" / "flüge.yaml", "out", flights)
+    first = outcomes([str(file)], capsys, 0)[0]
+    made = (tmp_path / "nord-ö" / "out" / "flug-ä" / "quality.json").stat().st_mtime_ns
+    second = outcomes([str(file)], capsys, 0)[0]
+    assert [first["skipped"], second["skipped"]] == [False, True]
+    assert first["points"] == second["points"] > 0
+    assert first["said"] == []  # what a good flight has to say is its verdict
+    assert (tmp_path / "nord-ö" / "out" / "flug-ä" / "quality.json").stat().st_mtime_ns == made
+    assert not outcomes([str(file), "--force"], capsys, 0)[0]["skipped"]
+
+
+def test_a_dry_run_names_logs_that_are_not_there(
+    tmp_path: Path, logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flights = [{"name": "a", "logs": [str(logs / "a.mcap")]}, {"name": "b", "logs": [str(logs / "bb.mcap")]}]
+    assert main(["batch", str(campaign(tmp_path / "flights.yaml", "out", flights)), "--dry-run"]) == 0
+    told = capsys.readouterr()
+    assert told.out.count("\n") == 2
+    assert told.err == f"swath: warning: b: {logs}/bb.mcap: no such file; there is {logs}/b.mcap\n"
+
+
+def test_a_bad_flight_is_bad_and_its_products_are_there(tmp_path: Path, logs: Path, bucket: str) -> None:
+    """By a stand-in for `swath process` that ends as that does on a bad flight: exit code 1, and quality.json printed."""
+    from groundproc.campaign import flight
+    from groundproc.campaign.flights import load_jobs
+
+    quality = {"verdict_reasons": [{"grade": "bad", "about": "x", "text": "y"}], "points": {"written": 7}}
+    told = json.dumps(quality)
+    stand_in = (
+        "import sys, pathlib; folder = pathlib.Path(sys.argv[sys.argv.index('-o') + 1]); folder.mkdir(parents=True, exist_ok=True);"
+        f" (folder / 'quality.json').write_text({told!r}); print({told!r}); sys.exit(1)"
+    )
+    flights = [{"name": "a", "logs": [str(logs / "a.mcap")]}]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flight, "_PROGRAM", stand_in)
+        for place in ("out", f"{bucket}/bad"):
+            found = flight.run_flight(load_jobs(campaign(tmp_path / "flights.yaml", place, flights), force=False)[0])
+            assert (found.exit_code, found.verdict, found.points) == (1, "bad", 7)
+    import s3fs
+
+    assert json.loads(s3fs.S3FileSystem(skip_instance_cache=True).cat_file("flights/bad/a/quality.json")) == quality
