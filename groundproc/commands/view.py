@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shlex
 import signal
 import sys
 import tempfile
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from flightlog.stopflag import StopFlag
     from groundproc.viewer.edits import Edit
     from groundproc.viewer.served import Served
     from groundproc.viewer.server import Save
@@ -59,24 +61,27 @@ def run(arguments: argparse.Namespace) -> int:
     cloud, paths = _chosen(arguments.cloud)
     if arguments.edited is not None:
         claim_file(arguments.edited, (".laz", ".las"), arguments.force, [cloud])
-    over = StopFlag()
+    over, at_once = StopFlag(), StopFlag()
 
     def end(number: int, frame: FrameType | None) -> None:
-        over.set()
+        (at_once if over.is_set() else over).set()
 
     with _served(cloud, paths) as served:
-        page = _page(ViewServer, served, arguments.port, _saver(cloud, served, arguments.edited))
+        page = _page(ViewServer, served, arguments.port, _saver(cloud, served, arguments.edited, at_once))
         before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             print(f"look at http://127.0.0.1:{page.port}/ (Ctrl-C ends it)", flush=True)
             over.wait()
+            if page.saving:
+                told = f"swath: {arguments.edited} is saved first; Ctrl-C again breaks it off"
+                print(told, file=sys.stderr, flush=True)
         finally:
+            page.close()
             for number, handler in before.items():
                 signal.signal(number, handler)
-            page.close()
         if page.unsaved:
             print(f"swath: warning: {page.unsaved} loop(s) of the lasso were not saved", file=sys.stderr)
-    return 0
+    return 130 if at_once.is_set() else 0
 
 
 def _chosen(path: Path) -> tuple[Path, list[npt.NDArray[np.float64]]]:
@@ -128,11 +133,9 @@ def _served(path: Path, paths: list[npt.NDArray[np.float64]]) -> Iterator[Served
     with contextlib.ExitStack() as stack:
         octree = path
         if not nodes.is_copc(path):
-            print(
-                f"{path}: has no index; one is made aside, and removed at the end (`swath export {path} -o NAME.copc.laz` keeps one)",
-                file=sys.stderr,
-                flush=True,
-            )
+            keeps = f"`swath export {shlex.quote(str(path))} -o NAME.copc.laz` keeps one"
+            told = f"{path}: has no index; one is made aside, and removed at the end ({keeps})"
+            print(told, file=sys.stderr, flush=True)
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="swath-view-")))
             octree = folder / "cloud.copc.laz"
             bar = tqdm(total=cloud.points, unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty())
@@ -141,8 +144,9 @@ def _served(path: Path, paths: list[npt.NDArray[np.float64]]) -> Iterator[Served
         yield stack.enter_context(Served(octree, path, paths))
 
 
-def _saver(path: Path, served: Served, output: Path | None) -> Save | None:
+def _saver(path: Path, served: Served, output: Path | None, at_once: StopFlag) -> Save | None:
     """What writes the copy."""
+    from flightlog.errors import SourceError
     from groundproc.cloud import reader
     from groundproc.files import written_aside
     from groundproc.viewer.edits import write_edited
@@ -150,10 +154,14 @@ def _saver(path: Path, served: Served, output: Path | None) -> Save | None:
     if output is None:
         return None
 
+    def go_on() -> None:
+        if at_once.is_set():
+            raise SourceError(f"{output}: saving was broken off")
+
     def save(edits: list[Edit]) -> dict[str, Any]:
         cloud = reader.look(path)
         with written_aside(output) as aside:
-            changed = write_edited(cloud, served.origin_m, edits, aside, output.suffix.lower() == ".laz")
+            changed = write_edited(cloud, served.origin_m, edits, aside, output.suffix.lower() == ".laz", go_on)
         print(f"{changed:,} of {cloud.points:,} points have another class in {output}", flush=True)
         return {"changed": changed, "points": cloud.points, "file": str(output)}
 

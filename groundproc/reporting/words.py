@@ -81,8 +81,8 @@ def facts(quality: Quality, density: float | None, area_m2: float | None) -> Htm
     rows = [
         ("Points", count(quality["points"]["written"])),
         ("Flown", f"{track['covered_s']:.0f} s"),
-        ("Area", "" if area_m2 is None else f"{area_m2 / 1e4:.2f} ha" if area_m2 >= 1e4 else f"{area_m2:.0f} m²"),
-        ("Density, median", "" if density is None else f"{density:.0f} /m²"),
+        ("Area", "" if area_m2 is None else f"{area_m2 / 1e4:.2f} ha" if area_m2 >= 1e4 else f"{count(area_m2)} m²"),
+        ("Density, median", "" if density is None else f"{count(density)} /m²"),
         ("Position in plan, one sigma", length(math.hypot(east, north))),
         ("Height, one sigma", length(up)),
         ("Level, one sigma", f"{max(level):.2f}°" if all(map(math.isfinite, level)) else ""),
@@ -98,7 +98,7 @@ def story(quality: Quality) -> Html:
     crs, height = quality["crs"], quality["height"]
     code = f" (EPSG:{crs['epsg']})" if crs["epsg"] else ""
     sentences = [
-        f"Recorded from {track['start']} to {track['end']} with a {quality['lidar']['model']}.",
+        f"Recorded from {track['start']} to {track['end']} by lidar {quality['lidar']['model']}.",
         f"Coordinates are in {crs['name']}{code}, heights {height['meaning']}.",
         f"The trajectory is that of method {track['method']}; its sigmas are the {track['sigma_source']}."
         if track["sigma_source"] else f"The trajectory is that of method {track['method']}.",

@@ -1,5 +1,6 @@
 """A product of a finished folder made again, without the logs: they may lie elsewhere by now."""
 
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,7 @@ def _expect_finished(request: Request, ledger: Ledger) -> None:
         missing = [unit for unit in step.units(request) if step.name in STEP.after and unit not in ledger.entries]
         if missing:
             raise UsageError(
-                f"{ledger.folder}: {missing[0]} is not made yet; `swath process {ledger.folder}` goes on with it"
+                f"{ledger.folder}: {missing[0]} is not made yet; `swath process {shlex.quote(str(ledger.folder))}` goes on with it"
             )
 
 

@@ -4,7 +4,7 @@ A loop holds in the picture that it was drawn in, so each edit brings the matrix
 `web/measure.js`: even-odd, points behind the eye and outside of a section are not meant, nor are classes that were hidden.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -148,7 +148,14 @@ def apply(edits: Sequence[Edit], local_m: Array, classes: Classes) -> Classes:
     return found
 
 
-def write_edited(cloud: Cloud, origin_m: Array, edits: Sequence[Edit], path: Path, compressed: bool = True) -> int:
+def write_edited(
+    cloud: Cloud,
+    origin_m: Array,
+    edits: Sequence[Edit],
+    path: Path,
+    compressed: bool = True,
+    go_on: Callable[[], None] = lambda: None,
+) -> int:
     """Write the cloud anew with other classes and nothing else changed; how many points changed.
 
     Parameters
@@ -161,6 +168,8 @@ def write_edited(cloud: Cloud, origin_m: Array, edits: Sequence[Edit], path: Pat
         Written to in place: the caller writes aside.
     compressed : bool
         LAZ; else LAS.
+    go_on : callable
+        Called every some points; what it raises ends the work.
 
     Raises
     ------
@@ -170,6 +179,7 @@ def write_edited(cloud: Cloud, origin_m: Array, edits: Sequence[Edit], path: Pat
     changed = 0
     with Rewriter(cloud, path, compressed) as writer:
         for chunk in chunks(cloud, columns=("classification",)):
+            go_on()
             classes = chunk.points["classification"]
             after = apply(edits, chunk.points.xyz_m - origin_m, classes)
             if (after != classes).any():

@@ -21,6 +21,8 @@ _SAMPLE: Final = 150_000
 _READERS: Final = 2
 """Nodes that are unpacked at the same time."""
 CLASS: Final = "classification"
+_BULK: Final = (5.0, 95.0)
+"""Percentiles of each axis between which most points lie."""
 
 
 class Served:
@@ -78,7 +80,8 @@ class Served:
         self._begin_s = float(time_s.min())
         self.shades = shades_of(columns, time_s - self._begin_s if self.cloud.timed else None, keep=(CLASS,))
         low, high = xyz.min(axis=0), xyz.max(axis=0)
-        self.origin_m = origin_of(low, high)
+        # single precision counts from where the points are, not from the middle to one that lies astray
+        self.origin_m = origin_of(*np.percentile(xyz, _BULK, axis=0))
         told = scene(self.origin_m, (low, high), xyz, self.shades, paths, octree.spacing_m, self.cloud.crs)
         self.scene: dict[str, Any] = told | {
             "name": of.name,

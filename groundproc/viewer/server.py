@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 from urllib.parse import SplitResult, parse_qs
 
-from flightlog.errors import SwathError
+from flightlog.errors import SwathError, UsageError
 from groundproc.machine.loopback import Handler, Loopback
 from groundproc.viewer.edits import Edit, edits_of
 from groundproc.viewer.page import VIEWER, held, page, script_of
@@ -43,13 +43,22 @@ class ViewServer(Loopback):
         self.edits: list[Edit] = []
         self.plain: list[Any] = []
         """The edits as the page sent them, for a page that is loaded again."""
+        self.version = 0
+        """Of the edits: a page that has not seen the last of them, because another window drew it, changes nothing."""
         self.unsaved = 0
+        self.saving = False
         self.lock = threading.Lock()
         super().__init__(type("Handler", (_Handler,), {"owner": self}), port, "view")
 
+    def close(self) -> None:
+        """Stop to serve, when what is being saved is whole or has failed."""
+        super().close()
+        with self.lock:
+            pass
+
     def page(self) -> bytes:
         """The page as it is now."""
-        told = self.served.scene | {"token": self.token, "editable": self.save is not None, "edits": self.plain}
+        told = self.served.scene | {"token": self.token, "editable": self.save is not None} | self.drawn()
         body = f'<div id="viewer" class="viewer whole"></div>{held("scene", told)}'
         text = page(
             f"{self.served.scene['name']} - swath view",
@@ -59,6 +68,10 @@ class ViewServer(Loopback):
             "; connect-src 'self'",
         )
         return text.encode()
+
+    def drawn(self) -> dict[str, Any]:
+        """The edits, and which they are."""
+        return {"edits": self.plain, "version": self.version}
 
 
 class _Handler(Handler):
@@ -84,29 +97,43 @@ class _Handler(Handler):
             return
         try:
             if self.path == "/edits" and self.owner.save is not None:
-                self._told(self._edits(body))
+                self._changed(body, self._edits)
             elif self.path == "/save" and self.owner.save is not None:
-                self._told(self._save())
+                self._changed(body, self._save)
             else:
                 self.answer(404, "text/plain", b"not here\n")
         except SwathError as error:
             self.answer(400, "text/plain; charset=utf-8", f"{error}\n".encode())
 
-    def _edits(self, body: bytes) -> dict[str, Any]:
+    def _changed(self, body: bytes, change: Callable[[Any], dict[str, Any]]) -> None:
+        """Do what is asked for by a page that knows all edits; any other is told them (409)."""
         try:
             plain = json.loads(body)
         except (ValueError, RecursionError):
             plain = None
-        edits = edits_of(plain)
+        if not isinstance(plain, dict):
+            raise UsageError("edits: expected an object with version and edits")
         with self.owner.lock:
-            self.owner.edits, self.owner.plain, self.owner.unsaved = edits, plain, len(edits)
-        return {"edits": len(edits)}
+            if plain.get("version") != self.owner.version:
+                self._told(self.owner.drawn(), 409)
+            else:
+                self._told(change(plain.get("edits")))
 
-    def _save(self) -> dict[str, Any]:
+    def _edits(self, plain: Any) -> dict[str, Any]:
+        edits = edits_of(plain)
+        owner = self.owner
+        owner.edits, owner.plain, owner.unsaved = edits, plain, len(edits)
+        owner.version += 1
+        return {"edits": len(edits), "version": owner.version}
+
+    def _save(self, _: Any) -> dict[str, Any]:
         assert self.owner.save is not None
-        with self.owner.lock:
+        self.owner.saving = True
+        try:
             found = self.owner.save(self.owner.edits)
-            self.owner.unsaved = 0
+        finally:
+            self.owner.saving = False
+        self.owner.unsaved = 0
         return found
 
     def _node(self, name: str) -> None:
@@ -134,5 +161,5 @@ class _Handler(Handler):
             return None
         return self.rfile.read(int(text))
 
-    def _told(self, value: dict[str, Any]) -> None:
-        self.answer(200, "application/json", json.dumps(value).encode())
+    def _told(self, value: dict[str, Any], code: int = 200) -> None:
+        self.answer(code, "application/json", json.dumps(value).encode())

@@ -17,6 +17,8 @@ NO_VALUE: Final = 255
 """The byte of a value that is not a number, or is none of the kinds that are named."""
 _MOST_KINDS: Final = 40
 """Whole numbers with more values than this are shown as a scale."""
+_ALL_KINDS: Final = ("classification",)
+"""Whole numbers that are kinds however many there are: classes of other programs, and those that a lasso gives."""
 _COLOURS: Final = ("red", "green", "blue")
 _MEASURES: Final = ("intensity", *_COLOURS, "nir")
 """Whole numbers that are a scale however few values they take."""
@@ -105,7 +107,7 @@ def _kinds(entry: Dimension, values: Values) -> Shade | None:
     if entry.scale is not None or entry.unit or entry.stored.kind not in "ui" or entry.name in _MEASURES:
         return None
     kinds = tuple(int(each) for each in np.unique(values))
-    if len(kinds) > _MOST_KINDS:
+    if len(kinds) > _MOST_KINDS and entry.name not in _ALL_KINDS:
         return None
     return Shade(entry.name, entry.brief, "", kinds, entry.stored == np.uint8)
 

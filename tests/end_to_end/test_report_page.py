@@ -170,6 +170,89 @@ def test_every_attribute_and_map_can_be_chosen_light_or_dark_large_or_small(page
     assert page.said == []
 
 
+def test_a_section_stands_beside_the_panel(page: Page) -> None:
+    page.looks(1100, 800)
+    settled(page)
+    low, high = page.run("[swathViewer.scene.core[0], swathViewer.scene.core[1]]")
+    page.run(f"swathViewer.sheet.open = true; swathViewer.cut({low}, {high})")
+    settled(page)
+    right_of = page.run("swathViewer.sheet.offsetLeft + swathViewer.sheet.offsetWidth")
+    width = page.run("swathViewer.canvas.clientWidth")
+    for end in "ab":
+        x, y, _ = page.run(f"swathViewer.project(swathViewer.view, swathViewer.slab.{end})")
+        assert right_of < x < width
+        assert 0 < y < page.run("swathViewer.canvas.clientHeight")
+    page.run("swathViewer.uncut()")
+    settled(page)
+
+
+def test_it_is_looked_at_and_measured_in_by_keys(page: Page) -> None:
+    page.run("swathViewer.camera.fit(swathViewer.aspect); swathViewer.canvas.focus(); swathViewer.turned()")
+    before = page.run("[swathViewer.camera.azimuth, swathViewer.camera.elevation, ...swathViewer.camera.centre]")
+    page.key("ArrowLeft", shift=True)
+    page.key("ArrowUp", shift=True)
+    after = page.run("[swathViewer.camera.azimuth, swathViewer.camera.elevation, ...swathViewer.camera.centre]")
+    assert after[0] != before[0]
+    assert after[1] != before[1]
+    assert after[2:] == before[2:]
+    page.key("ArrowLeft")
+    assert page.run("[...swathViewer.camera.centre]") != before[2:]
+    # from the picture through the panel to the tools, and out of a tool from where it was chosen
+    for _ in range(30):
+        page.key("Tab")
+        if page.run("document.activeElement === swathViewer.keys.area"):
+            break
+    page.key("Enter")
+    assert page.run("swathViewer.mode") == "area"
+    page.key("Escape")
+    assert page.run("swathViewer.mode") == "look"
+
+
+@pytest.mark.parametrize(("width", "height"), [(844, 390), (390, 844), (360, 640), (1024, 600)])
+def test_beside_the_cloud_there_is_room_for_a_finger_that_scrolls(page: Page, width: int, height: int) -> None:
+    page.looks(width, height, phone=width < 1000)
+    settled(page)
+    assert page.run("document.getElementById('viewer').offsetHeight") <= 0.9 * height
+    page.run("swathViewer.sheet.open = true; swathViewer.tool('distance')")
+    inside, outside = page.run(
+        "['.checks', '.panel'].map(s => document.querySelector(s)).map(e => [e.scrollWidth, e.clientWidth])"
+    )
+    assert inside[0] <= inside[1]
+    assert outside[0] <= outside[1]
+    hint, tools, panel = page.run(
+        "['.hint', '.tools', '.panel summary'].map(s => document.querySelector(s).getBoundingClientRect())"
+        ".map(b => [b.left, b.top, b.right, b.bottom])"
+    )
+    for other in (tools, panel):
+        assert hint[2] <= other[0] or hint[0] >= other[2] or hint[3] <= other[1] or hint[1] >= other[3]
+    page.run("swathViewer.tool('clear')")
+
+
+def contrast(page: Page, selector: str) -> float:
+    """Of a text to what is behind it (WCAG 2.2, 1.4.3)."""
+    colours = page.run(
+        f"(() => {{ const e = document.querySelector({selector!r}); let b = e;"
+        " while (getComputedStyle(b).backgroundColor === 'rgba(0, 0, 0, 0)' && b.parentElement) b = b.parentElement;"
+        " return [getComputedStyle(e).color, getComputedStyle(b).backgroundColor]; })()"
+    )
+    light = []
+    for colour in colours:
+        value = np.array([float(each) for each in re.findall(r"[\d.]+", colour)[:3]]) / 255.0
+        linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+        light.append(float(linear @ [0.2126, 0.7152, 0.0722]))
+    return (max(light) + 0.05) / (min(light) + 0.05)
+
+
+@pytest.mark.parametrize("medium", ["screen", "print"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_can_be_read_on_the_screen_and_on_paper(page: Page, medium: str, scheme: str) -> None:
+    page.call("Emulation.setEmulatedMedia", media=medium, features=[{"name": "prefers-color-scheme", "value": scheme}])
+    for selector in (".verdict p", ".verdict b", ".facts dt", ".facts dd", ".story", "h2", "#losses td"):
+        if page.run(f"!!document.querySelector({selector!r})"):
+            assert contrast(page, selector) >= 4.5, selector
+    page.call("Emulation.setEmulatedMedia", media="", features=[])
+
+
 def test_it_is_printed_by_one_option(folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / "out"
     shutil.copytree(folder, copy)

@@ -118,6 +118,26 @@ class Page:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
 
+    def key(self, name: str, *, shift: bool = False) -> None:
+        """Press a key, such as ArrowLeft, Tab or Enter."""
+        number = {
+            "Tab": 9,
+            "Enter": 13,
+            "Escape": 27,
+            "ArrowLeft": 37,
+            "ArrowUp": 38,
+            "ArrowRight": 39,
+            "ArrowDown": 40,
+        }
+        told: dict[str, Any] = {
+            "key": name,
+            "code": name,
+            "modifiers": 8 * shift,
+            "windowsVirtualKeyCode": number[name],
+        }
+        self.call("Input.dispatchKeyEvent", type="keyDown", **told, **({"text": "\r"} if name == "Enter" else {}))
+        self.call("Input.dispatchKeyEvent", type="keyUp", **told)
+
     def picture(self, whole: bool = False) -> bytes:
         """PNG."""
         found = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)

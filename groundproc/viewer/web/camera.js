@@ -59,6 +59,11 @@ function steer(canvas, camera, on) {
     const {right, up, perPixel} = camera.matrices(canvas.clientWidth, canvas.clientHeight);
     camera.centre = camera.centre.map((v, i) => v - perPixel * dx * right[i] + perPixel * dy * up[i]);
   }
+  // What is looked at from above, or as a section, is moved.
+  function turn(dx, dy) {
+    if (camera.elevation > 1.5 || camera.ortho) return pan(dx, dy);
+    camera.azimuth -= 0.006 * dx; camera.elevation = Math.min(Math.max(camera.elevation + 0.006 * dy, -0.4), 1.48);
+  }
   function zoom(factor, x, y) {
     const view = camera.matrices(canvas.clientWidth, canvas.clientHeight);
     const before = camera.distance;
@@ -85,8 +90,8 @@ function steer(canvas, camera, on) {
       const now = spread(), [a, b] = [...held.values()], box = canvas.getBoundingClientRect();
       zoom(pinch / Math.max(now, 1), (a.x + b.x) / 2 - box.left, (a.y + b.y) / 2 - box.top);
       pinch = now;
-    } else if (e.buttons & 6 || e.shiftKey || camera.elevation > 1.5 || camera.ortho) pan(dx, dy);
-    else { camera.azimuth -= 0.006 * dx; camera.elevation = Math.min(Math.max(camera.elevation + 0.006 * dy, -0.4), 1.48); }
+    } else if (e.buttons & 6 || e.shiftKey) pan(dx, dy);
+    else turn(dx, dy);
     on.turned();
   });
   const gone = e => {
@@ -106,10 +111,10 @@ function steer(canvas, camera, on) {
   }, {passive: false});
   canvas.addEventListener("keydown", e => {
     const moves = {ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40]};
-    if (moves[e.key]) pan(...moves[e.key]);
+    if (moves[e.key] && e.shiftKey) turn(...moves[e.key]);
+    else if (moves[e.key]) pan(...moves[e.key]);
     else if (e.key === "+" || e.key === "=") zoom(0.8, canvas.clientWidth / 2, canvas.clientHeight / 2);
     else if (e.key === "-") zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2);
-    else if (e.key === "Escape") on.escape();
     else return;
     e.preventDefault(); on.turned();
   });

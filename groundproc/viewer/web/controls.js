@@ -18,7 +18,7 @@ Viewer.prototype.panel = function () {
   this.sheet = make("details", {className: "panel", open: innerWidth > 640}, make("summary", {textContent: "Colour and tools"}),
     make("label", {className: "row"}, make("span", {textContent: "colour by"}), this.chooser), this.legend,
     make("label", {className: "row"}, make("span", {textContent: "point size"}), this.size),
-    make("div", {className: "row"}, make("label", {}, dome, " depth shading"), ...(this.scene.paths.length ? [make("label", {}, path, " flight path")] : [])),
+    make("div", {className: "row checks"}, make("label", {}, dome, " depth shading"), ...(this.scene.paths.length ? [make("label", {}, path, " flight path")] : [])),
     this.section, this.extra, this.results);
   this.bar = make("div", {className: "tools"},
     button("fit", "3D", "look from the side", () => { if (this.slab) this.uncut(); this.camera.fit(this.aspect); this.turned(); }),

@@ -83,6 +83,7 @@ class Octree {
       scene.shades.forEach((shade, k) => { bytes[shade.name] = new Uint8Array(raw, (12 + k) * node.count, node.count).slice(); });
       node.chunk = this.viewer.renderer.put(key, places, bytes, node.centre);
       node.chunk.first = node.level <= 2;
+      if (bytes.classification) this.viewer.meet(bytes.classification);
       if (this.onloaded) this.onloaded(node.chunk);
       node.state = "here";
     } catch (error) {
@@ -101,10 +102,11 @@ class Octree {
 // Classes changed by loops; the program behind the page does the same to the whole cloud when it is saved.
 class Editing {
   constructor(viewer, octree) {
-    Object.assign(this, {viewer, octree, edits: []});
+    Object.assign(this, {viewer, octree, edits: [], version: scene.version, met: 0, sent: Promise.resolve()});
     const button = (text, press) => make("button", {type: "button", textContent: text, onclick: press});
-    this.to = make("select", {id: "to-class", ariaLabel: "class that points get"}, ...Object.keys(CLASSES).map(code => make("option", {value: code, textContent: `${code} ${CLASSES[code][0]}`})));
-    this.to.value = "2";
+    this.to = make("select", {id: "to-class", ariaLabel: "class that points get"});
+    viewer.onmet = () => this.offer();
+    this.offer(); this.to.value = "2";
     this.note = make("p", {id: "edit-note", textContent: "Points within a loop get this class; hidden classes, and what lies outside a section, stay as they are."});
     viewer.keys.lasso = button("lasso", () => { viewer.shade("classification"); viewer.tool(viewer.mode === "lasso" ? "look" : "lasso"); });
     viewer.keys.lasso.id = "lasso";
@@ -114,7 +116,14 @@ class Editing {
     viewer.extra.append(make("label", {className: "row"}, make("span", {textContent: "class"}), this.to), make("div", {className: "row"}, viewer.keys.lasso, undo, save), this.note);
     viewer.onloop = loop => this.draw(loop);
     octree.onloaded = chunk => { chunk.original = chunk.bytes.classification.slice(); for (const edit of this.edits) reclassify(chunk, edit); };
-    if (scene.edits.length) this.take(scene.edits.map(withBox));
+    if (scene.edits.length) this.show(scene.edits.map(withBox));
+  }
+  // The classes that have names, and those of this cloud.
+  offer() {
+    const shade = this.viewer.shades.find(each => each.name === "classification"), chosen = this.to.value;
+    const codes = [...new Set([...Object.keys(CLASSES).map(Number), ...shade.kinds])].sort((a, b) => a - b);
+    this.to.replaceChildren(...codes.map(code => make("option", {value: code, textContent: nameOfKind(shade, code)})));
+    if (chosen) this.to.value = chosen;
   }
   draw(loop) {
     const {viewer} = this, view = viewer.view, step = Math.ceil(loop.length / 500);
@@ -125,6 +134,13 @@ class Editing {
     if (corners.length > 2) this.take([...this.edits, withBox({matrix: [...view.m], loop: corners, to: +this.to.value, of, slab})]);
   }
   take(edits) {
+    this.show(edits);
+    // one after the other: each names the version that it changes; what was drawn on loops that another window changed is dropped
+    const met = this.met, plain = edits.map(({matrix, loop, to, of, slab}) => ({matrix, loop, to, of, slab}));
+    this.sent = this.sent.then(async () => { if (met === this.met) this.version = (await this.send("/edits", plain)).version; })
+      .catch(error => this.say(error.message));
+  }
+  show(edits) {
     const {viewer} = this;
     this.edits = edits;
     let changed = 0;
@@ -133,23 +149,28 @@ class Editing {
       for (const edit of edits) changed += reclassify(chunk, edit);
       viewer.renderer.changed(chunk);
     }
-    const shade = viewer.shades.find(each => each.name === "classification");
-    shade.kinds = [...new Set([...shade.kinds, ...edits.map(each => each.to)])].sort((a, b) => a - b);
-    if (viewer.current === shade) viewer.shade("classification");
+    viewer.meet(edits.map(each => each.to));
     this.say(edits.length ? `${edits.length} loop${edits.length > 1 ? "s" : ""}, ${changed.toLocaleString("en")} of the points shown changed; not saved yet.` : "Nothing is changed.");
-    this.sent = this.send("/edits", edits.map(({matrix, loop, to, of, slab}) => ({matrix, loop, to, of, slab}))).catch(error => this.say(error.message));
     viewer.dirty = true;
   }
   async save() {
+    const met = this.met;
     this.say("Saving the whole cloud …");
     try {
       await this.sent;
-      const found = await this.send("/save", null);
+      if (met !== this.met) return;
+      const found = await this.send("/save");
       this.say(`${found.changed.toLocaleString("en")} of ${found.points.toLocaleString("en")} points changed; saved to ${found.file}.`);
     } catch (error) { this.say(error.message); }
   }
-  async send(where, what) {
-    const answer = await fetch(where, {method: "POST", headers: {"X-Swath-Token": scene.token, "Content-Type": "application/json"}, body: JSON.stringify(what)});
+  async send(where, edits) {
+    const body = JSON.stringify({version: this.version, edits});
+    const answer = await fetch(where, {method: "POST", headers: {"X-Swath-Token": scene.token, "Content-Type": "application/json"}, body});
+    if (answer.status === 409) {
+      const now = await answer.json();
+      this.met++; this.version = now.version; this.show(now.edits.map(withBox));
+      throw new Error("Another window changed the loops: they are shown now. Look at them, and do it again.");
+    }
     if (!answer.ok) throw new Error((await answer.text()).trim());
     return answer.json();
   }

@@ -26,10 +26,12 @@ class Viewer {
     if (["red", "green", "blue"].every(name => scene.shades.some(each => each.name === name)))
       this.shades.push({name: "rgb", label: "colour", unit: "", kinds: [], shown: [0, 1]});
     steer(this.canvas, this.camera, {
-      turned: () => this.turned(), click: (x, y) => this.click(x, y), escape: () => this.tool("look"),
+      turned: () => this.turned(), click: (x, y) => this.click(x, y),
       drags: () => this.mode === "lasso", drag: (kind, x, y) => this.lasso(kind, x, y),
       wheel: e => document.fullscreenElement || place.classList.contains("whole") || e.ctrlKey || this.canvas === document.activeElement,
     });
+    // wherever the focus is, as after a press on the tool
+    place.addEventListener("keydown", e => { if (e.key === "Escape" && this.mode !== "look") { this.tool("look"); e.preventDefault(); } });
     this.canvas.addEventListener("dblclick", e => {
       const box = this.canvas.getBoundingClientRect(), hit = this.hit(e.clientX - box.left, e.clientY - box.top);
       if (hit) { this.camera.centre = this.placeOf(hit); this.camera.distance *= 0.6; this.turned(); }
@@ -92,6 +94,15 @@ class Viewer {
     this.palette = paletteOf(shade.name === "rgb" ? HEIGHT : shade, this.hidden);
     this.dirty = true;
   }
+  // Classes that may be new: the first points told of the frequent ones only.
+  meet(classes) {
+    const shade = this.shades.find(each => each.name === "classification"), known = new Set(shade.kinds), before = known.size;
+    for (const each of classes) known.add(each);
+    if (known.size === before) return;
+    shade.kinds = [...known].sort((a, b) => a - b);
+    if (this.current === shade) { this.spread(); drawLegend(this); }
+    if (this.onmet) this.onmet();
+  }
   toggle(byte) { if (!this.hidden.delete(byte)) this.hidden.add(byte); this.spread(); drawLegend(this); }
   visible(chunk, i) { return !this.hidden.size || !this.hidden.has(chunk.bytes[this.current.name][i]); }
   hit(x, y) { return pick(this.renderer.chunks.values(), this.view, this.slab, (chunk, i) => this.visible(chunk, i), x, y); }
@@ -136,7 +147,11 @@ class Viewer {
     const {camera} = this;
     camera.ortho = true; camera.elevation = 0; camera.azimuth = Math.atan2(-slab.n[1], -slab.n[0]);
     camera.centre = [0, 1, 2].map(i => (a[i] + b[i]) / 2);
-    camera.distance = slab.length * 0.68 / Math.tan(FOV / 2) * Math.min(1, this.canvas.clientHeight / this.canvas.clientWidth);
+    // it stands beside the panel, not under it
+    const {clientWidth: width, clientHeight: height} = this.canvas, covered = this.sheet.open && width > 640 ? this.sheet.offsetLeft + this.sheet.offsetWidth : 0;
+    camera.distance = slab.length * 0.56 / Math.tan(FOV / 2) * Math.min(width / (width - covered), height / (width - covered));
+    const {perPixel, right} = camera.matrices(width, height);
+    camera.centre = camera.centre.map((v, i) => v - covered / 2 * perPixel * right[i]);
     this.thickness.value = String(Math.log10(2 * half)); this.section.hidden = false;
     this.turned(); drawResults(this);
   }

@@ -107,17 +107,27 @@ def test_only_this_machine_by_its_own_name_and_only_the_page_may_change_anything
 ) -> None:
     assert ask(server, "/", Host="evil.example")[0] == 403
     loop = {"matrix": np.eye(4).ravel().tolist(), "loop": [[0, 0], [1, 0], [1, 1]], "to": 2, "of": None, "slab": None}
-    assert ask(server, "/edits", "POST", [loop])[0] == 403
+    assert ask(server, "/edits", "POST", {"version": 0, "edits": [loop]})[0] == 403
     assert ask(server, "/save", "POST", None, X_Swath_Token="guessed")[0] == 403
     assert ask(server, "/save", "POST", None, X_Swath_Token=server.token, Host="evil.example")[0] == 403
     assert server.edits == []
     assert saved == []
     own = {"X_Swath_Token": server.token}
-    assert ask(server, "/edits", "POST", {"no": "edits"}, **own) == (400, b"edits: expected a list of 10000 at most\n")
-    assert ask(server, "/edits", "POST", [loop], **own) == (200, b'{"edits": 1}')
+    sentence = b"edits: expected a list of 10000 at most\n"
+    assert ask(server, "/edits", "POST", {"version": 0, "edits": {}}, **own) == (400, sentence)
+    assert ask(server, "/edits", "POST", [loop], **own)[0] == 400
+    told = ask(server, "/edits", "POST", {"version": 0, "edits": [loop]}, **own)
+    assert told == (200, b'{"edits": 1, "version": 1}')
     assert server.unsaved == 1
     assert b'"edits":[{"matrix":[1.0' in ask(server, "/")[1]  # a page that is loaded again has them
-    assert ask(server, "/save", "POST", None, **own)[0] == 200
+    for path in (
+        "/edits",
+        "/save",
+    ):  # a page that was loaded before that loop was drawn is told of it, and changes nothing
+        status, body = ask(server, path, "POST", {"version": 0, "edits": []}, **own)
+        assert (status, json.loads(body)) == (409, {"edits": [loop], "version": 1})
+    assert (server.unsaved, saved) == (1, [])
+    assert ask(server, "/save", "POST", {"version": 1}, **own)[0] == 200
     assert [len(edits) for edits in saved] == [1]
     assert server.unsaved == 0
     assert ask(server, "/edits", "POST", [], Content_Length=str(10**9), **own)[0] == 413

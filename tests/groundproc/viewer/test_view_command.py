@@ -1,11 +1,15 @@
 """`swath view` in a real browser: levels of detail, and classes changed by the mouse."""
 
 import contextlib
+import http.client
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -27,9 +31,9 @@ POINTS = 150_000
 
 
 @contextlib.contextmanager
-def viewed(*words: object) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
-    """The command, and the address that it names."""
-    code = "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
+def viewed(*words: object, before: str = "") -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
+    """The command, after some lines of Python, and the address that it names."""
+    code = before + "import sys; from groundproc.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "view", *map(str, words), "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
     try:
@@ -183,6 +187,129 @@ def test_a_lasso_changes_classes_of_a_copy_and_nothing_else(tab: Page, clouds: C
     inside = contains_xy(Polygon(loop), flat[:, 0] / flat[:, 3], flat[:, 1] / flat[:, 3])
     np.testing.assert_array_equal(changed, inside)
     assert changed.sum() > 1000
+
+
+@needs_browser
+def test_of_two_windows_none_loses_the_loops_of_the_other(tab: Page, clouds: Clouds, tmp_path: Path) -> None:
+    plain, out = clouds(POINTS)[0], tmp_path / "edited.laz"
+    with viewed(plain, "--edited", out) as (address, _), browser(tmp_path / "second") as other:
+        other.looks(1000, 700)
+        for page in (tab, other):
+            page.open(address)
+            settled(page)
+            page.run("swathViewer.camera.above(); swathViewer.turned()")
+            settled(page)
+            page.run("document.getElementById('to-class').value = '9'")
+            page.press("#lasso")
+        tab.drag([(420, 300), (520, 300), (520, 400)])
+        tab.run("swathViewer.editing.sent")
+        other.drag([(600, 300), (700, 300), (700, 400)])
+        other.drag([(600, 200), (700, 200), (700, 290)])  # before the first is answered
+        other.until("document.getElementById('edit-note').textContent.includes('Another window')")
+        other.run("swathViewer.editing.sent")
+        assert other.run("swathViewer.editing.edits.length") == 1
+        assert not out.exists()
+        other.drag([(600, 300), (700, 300), (700, 400)])
+        other.run("swathViewer.editing.sent")
+        loops = other.run("swathViewer.editing.edits.map(each => [each.matrix, each.loop])")
+        other.press("#save")
+        other.until("document.getElementById('edit-note').textContent.includes('saved to')")
+        origin = np.array(other.run("swathViewer.scene.origin"))
+        assert len(loops) == 2
+    from shapely import Polygon, contains_xy
+
+    before, after = laspy.read(plain), laspy.read(out)
+    inside = np.zeros(POINTS, bool)
+    for matrix, loop in loops:
+        flat = np.column_stack([before.xyz - origin, np.ones(POINTS)]) @ np.array(matrix).reshape(4, 4)
+        found = contains_xy(Polygon(loop), flat[:, 0] / flat[:, 3], flat[:, 1] / flat[:, 3])
+        assert found.sum() > 100
+        inside |= found
+    np.testing.assert_array_equal(np.asarray(after.classification) != np.asarray(before.classification), inside)
+
+
+def posted(address: str, where: str, what: object) -> int:
+    """As the page does it; the status of the answer, 0 without one."""
+    from urllib.error import HTTPError
+    from urllib.request import Request, urlopen
+
+    token = json.loads(re.findall(r'id="scene">(.*?)</script>', urlopen(address).read().decode())[0])["token"]
+    try:
+        with urlopen(Request(address + where, json.dumps(what).encode(), {"X-Swath-Token": token})) as answer:
+            return int(answer.status)
+    except HTTPError as error:
+        return error.code
+    except (OSError, http.client.HTTPException):  # the program ended before it answered
+        return 0
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_interrupt_while_saving_leaves_a_whole_file_or_none(clouds: Clouds, tmp_path: Path, again: bool) -> None:
+    """Each chunk of the saving program waits for a file to go, so that the interrupt comes in the middle."""
+    plain, out, gate = clouds(POINTS)[0], tmp_path / "edited.laz", tmp_path / "gate"
+    gate.touch()
+    slow = (
+        "import time; from pathlib import Path; from groundproc.viewer import edits; real = edits.apply\n"
+        f"def apply(*words):\n    while Path({str(gate)!r}).exists() and not Path({str(gate)!r} + '2').exists():"
+        " time.sleep(0.02)\n    return real(*words)\n"
+        "edits.apply = apply\n"
+    )
+    loop = {"matrix": np.diag([1e-3, 1e-3, 1e-3, 1.0]).ravel().tolist(), "loop": [[-9, -9], [9, -9], [0, 9]], "to": 9}
+    with viewed(plain, "--edited", out, before=slow) as (address, process):
+        assert posted(address, "edits", {"version": 0, "edits": [loop]}) == 200
+        thread = threading.Thread(target=posted, args=(address, "save", {"version": 1}))
+        thread.start()
+        deadline = time.monotonic() + 60.0
+        while not list(tmp_path.glob(".edited.laz.*.part")) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        said = ""
+        while "is saved first" not in said:
+            said = process.stderr.readline()
+            assert said
+        if again:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.2)
+        gate.unlink()
+        assert process.wait(60) == (130 if again else 0)
+        thread.join()
+    if again:
+        assert sorted(path.name for path in tmp_path.iterdir()) == []
+    else:
+        assert set(np.asarray(laspy.read(out).classification).tolist()) == {9}
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["edited.laz"]
+
+
+@needs_browser
+def test_classes_of_other_programs_keep_their_numbers(tab: Page, tmp_path: Path) -> None:
+    """More of them than have names, none below 20, and one of three points in 200 000 that the first nodes do not hold."""
+    rng = np.random.default_rng(3)
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = [0.001] * 3, [533_000.0, 6_472_000.0, 0.0]
+    header.add_crs(projected_crs(32633))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = rng.uniform([533_000, 6_472_000, 50], [533_080, 6_472_060, 50.02], (200_000, 3)).T
+    classes = rng.integers(20, 120, 200_000).astype(np.uint8)
+    classes[[5, 77, 4321]] = 250
+    cloud.classification = classes
+    cloud.write(str(tmp_path / "fremd ä.laz"))
+    with viewed(tmp_path / "fremd ä.laz", "--edited", tmp_path / "x.laz") as (address, _):
+        tab.open(address)
+        settled(tab)
+        tab.run("swathViewer.shade('classification')")
+        tab.run("swathViewer.octree.budget = 1e7; swathViewer.camera.above(); swathViewer.octree.choose()")
+        settled(tab)
+        held = tab.run("[...swathViewer.renderer.chunks.values()].flatMap(c => [...c.bytes.classification])")
+        assert len(held) == 200_000
+        assert np.bincount(held, minlength=256).tolist() == np.bincount(classes, minlength=256).tolist()
+        named = tab.run("[...document.querySelectorAll('.kinds button')].map(each => each.textContent)")
+        assert [int(each.split()[0]) for each in named] == np.unique(classes).tolist()
+        offered = tab.run("[...document.querySelectorAll('#to-class option')].map(each => +each.value)")
+        assert set(np.unique(classes).tolist()) <= set(offered)
+        assert offered == sorted(offered)
+        assert tab.run("document.getElementById('to-class').value") == "2"
+        assert tab.said == []
 
 
 @needs_browser
