@@ -80,7 +80,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         write_json(arguments.json, told)
     density = told["density"]
-    batteries = "" if arguments.battery is None else f", {made.batteries} batteries"
+    batteries = (
+        "" if arguments.battery is None else f", {made.batteries} {'battery' if made.batteries == 1 else 'batteries'}"
+    )
     print(
         f"{told['lines']} lines {told['spacing_m']:.1f} m apart, {told['length_m'] / 1000.0:.2f} km, "
         f"{told['seconds'] / 60.0:.1f} min{batteries}\n"

@@ -116,7 +116,7 @@ def plan(wish: Wish) -> Plan:
     strip = swath(sensors.lidar("HDL-32E"), wish.leaning(), wish.gate, wish.height_m, wish.speed_m_s)
     spacing = _spacing(wish, strip)
     flown = route(area, spacing, wish.speed_m_s, wish.heading_deg, wish.margin_m, wish.calibrate)
-    batteries = 1 if wish.battery_s is None else int(np.ceil(flown.seconds / wish.battery_s))
+    batteries = 1 if wish.battery_s is None else flown.batteries(wish.battery_s)
     return Plan(area, crs, flown, strip, spacing, batteries)
 
 

@@ -31,6 +31,7 @@ class Route:
     lines : int
     length_m, seconds : float
         Turns, climb and return included in the time.
+    speed_m_s : float
     """
 
     places_m: Array
@@ -38,6 +39,42 @@ class Route:
     lines: int
     length_m: float
     seconds: float
+    speed_m_s: float
+
+    def batteries(self, each_s: float) -> int:
+        """How many a flight takes, if each climbs at the first place, goes on where the one before it turned, and returns.
+
+        Raises
+        ------
+        UsageError
+            One is not enough for the way to a line, the line and the way back.
+        """
+        count, at, turns = 1, 0, len(self.places_m) - 1
+        while True:
+            reached = self._reached(at, each_s)
+            if reached == at:
+                need = self._seconds(at, at + 1) / 60.0
+                raise UsageError(
+                    f"--battery {each_s / 60.0:g}: {need:.1f} min are needed from turning point {at + 1} to the next one, with "
+                    "climb and the ways there and back; fly faster, or a smaller area"
+                )
+            if reached == turns:
+                return count
+            # a line that the battery does not end is begun anew: what lies between two turns is flown in one
+            count, at = count + 1, reached
+
+    def _reached(self, at: int, each_s: float) -> int:
+        """The last turning point that a battery reaches from another."""
+        last = at
+        while last + 1 < len(self.places_m) and self._seconds(at, last + 1) <= each_s:
+            last += 1
+        return last
+
+    def _seconds(self, first: int, last: int) -> float:
+        """Of a flight from home to a turning point, on to another, and back."""
+        part = self.places_m[[0, *range(first, last + 1), 0]]
+        length = np.linalg.norm(np.diff(part, axis=0), axis=1).sum()
+        return float(length) / self.speed_m_s + (last - first + 1) * _TURN_S + _CLIMB_S
 
 
 def route(
@@ -71,7 +108,7 @@ def route(
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     home = float(np.linalg.norm(path[-1] - path[0]))
     seconds = (length + home) / speed_m_s + len(path) * _TURN_S + _CLIMB_S
-    return Route(path, heading, len(lines), length, seconds)
+    return Route(path, heading, len(lines), length, seconds, speed_m_s)
 
 
 def _along(area: Any) -> float:

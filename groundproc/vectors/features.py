@@ -90,7 +90,11 @@ def read_features(path: Path, kind: str) -> Features:
     if path.suffix.lower() not in DRIVERS:
         raise CaptureError(f"{path}: expected a name that ends in {' or '.join(DRIVERS)}")
     try:
-        meta, _, wkb, fields = pyogrio.raw.read(path)
+        with (
+            warnings.catch_warnings()
+        ):  # what GDAL takes for a trifle, such as a ring that is open, is said below or is none
+            warnings.simplefilter("ignore", RuntimeWarning)
+            meta, _, wkb, fields = pyogrio.raw.read(path)
         geometry = shapely.from_wkb(wkb)
     except _DAMAGE as error:
         raise CaptureError(f"{path}: cannot be read ({' '.join(str(error).split())})") from None

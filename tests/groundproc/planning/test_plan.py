@@ -8,6 +8,7 @@ import pytest
 import shapely
 from pymavlink import mavwp
 
+from flightlog.errors import UsageError
 from flightlog.frames import mat_local_ins
 from flightlog.mount import Mount
 from groundproc import sensors
@@ -97,6 +98,26 @@ def test_every_place_of_the_area_lies_between_two_lines(shape: list[tuple[float,
         away = offset[beside] - place @ right
         assert ((away >= -1e-9) & (away <= spacing_m)).any()
         assert ((away <= 1e-9) & (away >= -spacing_m)).any()
+
+
+def test_each_battery_climbs_flies_to_where_the_last_one_turned_and_comes_back() -> None:
+    """Two lines of 200 m, 50 m apart, at 5 m/s; 6 s a turning point and 20 s to climb: by hand."""
+    flown = route(shapely.box(0.0, 0.0, 180.0, 49.9), 50.0, 5.0, 90.0, 10.0, calibrate=False)
+    assert (flown.lines, len(flown.places_m)) == (2, 4)
+    # 450 m and 50 m home, four turning points
+    whole = 500.0 / 5.0 + 4 * 6.0 + 20.0
+    assert flown.seconds == pytest.approx(whole)
+    # line, move over and straight back; the other way round: to there, line, back
+    diagonal = np.hypot(200.0, 50.0)
+    first, second = (250.0 + diagonal) / 5.0 + 3 * 6.0 + 20.0, (diagonal + 200.0 + 50.0) / 5.0 + 2 * 6.0 + 20.0
+    assert flown.batteries(whole + 0.1) == 1
+    assert flown.batteries(whole - 0.1) == 2
+    assert flown.batteries(first + 0.1) == 2
+    assert flown.batteries(first - 0.1) == 3  # back from the first line's end, 400 m; move over, 123 s; second line
+    assert flown.batteries(second + 0.1) == 3
+    with pytest.raises(UsageError, match=r"^--battery 2: 2\.1 min are needed from turning point 2 to the next one"):
+        flown.batteries(120.0)
+    assert flown.batteries(1e9) == 1
 
 
 def test_a_mission_is_read_by_pymavlink_and_lies_where_the_area_is(
