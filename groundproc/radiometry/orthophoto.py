@@ -14,7 +14,7 @@ from groundproc.cloud.metres import flat, metres_in
 from groundproc.cloud.selection import SURFACES
 from groundproc.files import written_aside
 from groundproc.raster import geotiff
-from groundproc.raster.cells import Cells
+from groundproc.raster.cells import Cells, column_and_row
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
 from groundproc.raster.movingplanes import moving_planes
@@ -115,13 +115,14 @@ class _Blocks:
     def add(self, xyz_m: Array, values: Array, tops: Cells) -> None:
         """Take points, shape (n, 3) and (n,)."""
         good = np.isfinite(values)
-        good[good] = xyz_m[good, 2] >= self._top(xyz_m[good], tops) - self._top_within
+        if good.any():
+            good[good] = xyz_m[good, 2] >= tops.at(xyz_m[good], "max") - self._top_within
         self.used += int(good.sum())
         records = np.empty(int(good.sum()), self._dtype)
         records["x"], records["y"], records["value"] = xyz_m[good, 0], xyz_m[good, 1], values[good]
         grid = self._grid
-        right = np.floor(records["x"] / grid.cell_m).astype(np.int64) - grid.column
-        down = grid.row + grid.rows - np.ceil(records["y"] / grid.cell_m).astype(np.int64)
+        column, row = column_and_row(np.stack([records["x"], records["y"]], axis=1), grid.cell_m).T
+        right, down = column - grid.column, grid.row + grid.rows - 1 - row
         for i in (-1, 0, 1):
             for j in (-1, 0, 1):
                 near = self._near(right, i) & self._near(down, j)
@@ -139,21 +140,6 @@ class _Blocks:
         if step == 0:
             return np.ones(len(cell), np.bool_)
         return np.asarray(within < _MARGIN_CELLS if step < 0 else within >= _BLOCK - _MARGIN_CELLS)
-
-    def _top(self, xyz_m: Array, tops: Cells) -> Array:
-        """Highest point of the cell of each point."""
-        if not len(xyz_m):
-            return np.empty(0)
-        column = np.floor(xyz_m[:, 0] / tops.cell_m).astype(np.int64)
-        row = np.ceil(xyz_m[:, 1] / tops.cell_m).astype(np.int64) - 1
-        out = np.empty(len(xyz_m))
-        big = (column >> 10) * (1 << 32) + (row >> 10)
-        for key in np.unique(big):
-            own = np.flatnonzero(big == key)
-            window = Window(int(column[own[0]] >> 10) << 10, int(row[own[0]] >> 10) << 10, 1024, 1024)
-            values = tops.window(window, "max")
-            out[own] = values[1023 - (row[own] - window.row), column[own] - window.column]
-        return out
 
     def block(self, window: Window) -> npt.NDArray[np.float32]:
         """Values of a block of the raster."""

@@ -21,6 +21,8 @@ _BITS: Final = 8
 SIDE: Final = 1 << _BITS
 """Cells along one side of a tile."""
 _MASK: Final = SIDE - 1
+_ROUNDING, _ROUNDED = 1e-9, 2e-15
+"""Of a cell, and of its number: some steps of double precision, of coordinates with an offset, their unit and the size of the cell."""
 _DIRECT: Final = 1 << 22
 """Tiles within the bounds of one piece of points up to which they are found by a table."""
 
@@ -194,6 +196,11 @@ def cells_of(
     return within, number, tiles
 
 
+def column_and_row(xyz_m: Array, cell_m: float) -> npt.NDArray[np.int64]:
+    """Column and row of the cell of each point, shape (n, 2), counted from the origin."""
+    return np.asarray(_columns_and_rows(xyz_m, 1.0 / cell_m))
+
+
 def _numbered(
     column: npt.NDArray[np.int32], row: npt.NDArray[np.int32]
 ) -> tuple[npt.NDArray[np.int32], list[tuple[int, int]]]:
@@ -209,16 +216,37 @@ def _numbered(
     return number, [(int(key % width) + x0, int(key // width) + y0) for key in found]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def edged(place_m: float, per_m: float) -> float:
+    """A place in cells; what only rounding keeps off an edge lies on it.
+
+    Sizes such as 0.3 m and steps of a millimetre have no exact binary numbers: without this, a point of a lattice on the edges would
+    fall into either cell beside it as the last bit has it.
+    """
+    cells = place_m * per_m
+    near = np.rint(cells)
+    return near if abs(cells - near) <= _ROUNDING + _ROUNDED * abs(near) else cells
+
+
 @njit(cache=True, nogil=True)
 def _cells(xyz_m: Any, per_m: float) -> Any:
     """Cell within its tile, and column and row of the tile, of each point."""
     n = len(xyz_m)
     within, column, row = np.empty(n, np.uint16), np.empty(n, np.int32), np.empty(n, np.int32)
     for i in range(n):
-        x, y = np.int64(np.floor(xyz_m[i, 0] * per_m)), np.int64(np.ceil(xyz_m[i, 1] * per_m)) - 1
+        x, y = np.int64(np.floor(edged(xyz_m[i, 0], per_m))), np.int64(np.ceil(edged(xyz_m[i, 1], per_m))) - 1
         within[i] = (y & _MASK) << _BITS | (x & _MASK)
         column[i], row[i] = x >> _BITS, y >> _BITS
     return within, column, row
+
+
+@njit(cache=True, nogil=True)
+def _columns_and_rows(xyz_m: Any, per_m: float) -> Any:
+    out = np.empty((len(xyz_m), 2), np.int64)
+    for i in range(len(xyz_m)):
+        out[i, 0] = np.int64(np.floor(edged(xyz_m[i, 0], per_m)))
+        out[i, 1] = np.int64(np.ceil(edged(xyz_m[i, 1], per_m))) - 1
+    return out
 
 
 @njit(cache=True, nogil=True)

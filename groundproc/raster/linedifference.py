@@ -17,7 +17,7 @@ from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud.points import Points
 from groundproc.numerics.voxelhash import sorted_by
 from groundproc.raster import geotiff
-from groundproc.raster.cells import SIDE, cells_of
+from groundproc.raster.cells import SIDE, cells_of, edged
 from groundproc.raster.geotiff import Band
 from groundproc.raster.grid import Grid, Window, checked_cell
 
@@ -212,10 +212,12 @@ def _differences(tile: _Tile) -> Values:
 def _take(xyz_m: Any, within: Any, some: Any, frame: Any, sums: Any, line: Any) -> None:
     """Add points of one line to the cells of a tile: means and products about them by Welford (1962)."""
     cell_m, height_m = frame
+    per_m = 1.0 / cell_m
     for i in some:
         cell = within[i]
-        x = (xyz_m[i, 0] / cell_m - np.floor(xyz_m[i, 0] / cell_m) - 0.5) * cell_m
-        y = (xyz_m[i, 1] / cell_m - np.ceil(xyz_m[i, 1] / cell_m) + 0.5) * cell_m
+        east, north = edged(xyz_m[i, 0], per_m), edged(xyz_m[i, 1], per_m)
+        x = (east - np.floor(east) - 0.5) * cell_m
+        y = (north - np.ceil(north) + 0.5) * cell_m
         z = xyz_m[i, 2] - height_m
         line[cell, 0] += 1
         count = line[cell, 0]

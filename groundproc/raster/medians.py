@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.raster.cells import SIDE
+from groundproc.raster.cells import SIDE, column_and_row
 from groundproc.raster.grid import Grid, Window
 
 Array = npt.NDArray[np.float64]
@@ -40,8 +40,7 @@ class Medians:
         """Take points, shape (n, 3) of which two are used, and a value of each, shape (n,); what is not finite is left out."""
         values = np.asarray(values, np.float64)
         keep = np.isfinite(values) & np.isfinite(xyz_m[:, :2]).all(axis=1)
-        cell = xyz_m[keep, :2] * (1.0 / self.cell_m)
-        cell = np.stack([np.floor(cell[:, 0]), np.ceil(cell[:, 1]) - 1.0], axis=1).astype(np.int64)
+        cell = column_and_row(xyz_m[keep], self.cell_m)
         record = np.empty(len(cell), _VALUE)
         record["tile_x"], record["tile_y"] = cell[:, 0] // SIDE, cell[:, 1] // SIDE
         record["cell"] = cell[:, 1] % SIDE * SIDE + cell[:, 0] % SIDE

@@ -56,6 +56,29 @@ def test_every_cell_holds_the_statistic_of_its_own_points(statistic: str, cell_m
         assert counted[:, [0, -1]].any(axis=0).all(), "no column at the edge is empty"
 
 
+@pytest.mark.parametrize("offset_m", [(500_000.0, 5_600_000.0), (2_600_000.0, 1_200_000.0), (-30.0, -20.0)])
+@pytest.mark.parametrize("cell_mm", [10, 50, 100, 200, 250, 300, 400, 600, 700])
+def test_a_lattice_on_the_edges_has_one_point_in_each_cell(
+    cell_mm: int, offset_m: tuple[float, float], tmp_path: Path
+) -> None:
+    """Another program's terrain model as a cloud: places as LAS makes them, of whole millimetres; so whole numbers tell the cells."""
+    own_mm = [cell_mm - round(1000 * each) % cell_mm for each in offset_m]
+    column, row = (each.ravel() for each in np.meshgrid(np.arange(60), np.arange(60)))
+    x, y = ((start + cell_mm * k) * 0.001 + off for start, off, k in zip(own_mm, offset_m, (column, row), strict=True))
+    xyz = np.stack([x, y, 1000.0 * column + row], axis=1)
+    first = [(round(1000 * off) + start) // cell_mm for off, start in zip(offset_m, own_mm, strict=True)]
+    expected = (1000.0 * column + row).reshape(60, 60)[::-1]
+    for cells, statistic in (
+        (Cells(cell_mm / 1000, {"max", "count"}), "max"),
+        (Medians(cell_mm / 1000, tmp_path), "median"),
+    ):
+        cells.add(xyz, xyz[:, 2])
+        grid = cells.grid()
+        # a point on an edge is of the cell east or south of it
+        assert grid == Grid(first[0], first[1] - 1, 60, 60, cell_mm / 1000)
+        np.testing.assert_array_equal(cells.window(grid, statistic), expected)
+
+
 def test_a_mean_of_very_many_points_keeps_its_digits() -> None:
     """Two million heights about 4000 m: a sum in float32 would be decimetres off."""
     heights = 4000.0 + np.random.default_rng(2).normal(0.0, 0.02, 2_000_000)

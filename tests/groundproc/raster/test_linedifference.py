@@ -66,6 +66,19 @@ def test_lines_that_sampled_other_parts_of_a_steep_cell_do_not_differ() -> None:
     assert abs(np.nanmean(found)) < 0.005
 
 
+def test_points_on_the_edges_of_cells_lie_where_their_cells_are() -> None:
+    """A lattice of 0.1 m in cells of 0.3 m: a point taken for one of the far side of its cell would be off by 0.15 m."""
+    east, north = (each.ravel() for each in np.meshgrid(np.arange(120), np.arange(120)))
+    xyz = np.stack([500_000.0 + 0.1 * east, 5_600_000.0 + 0.1 * north, 50.0 + 0.05 * east + 0.03 * north], axis=1)
+    cells = LineDifferences(0.3)
+    for number in (1, 2):
+        lifted = xyz + [0.0, 0.0, 0.07 * (number - 1)]
+        cells.add(Points(np.zeros(len(xyz), np.int64), lifted, {"point_source_id": np.full(len(xyz), number, np.uint16)}))
+    # 500,000 m are 1,666,666 cells and two thirds, 5,600,000 m are 18,666,666 and two thirds: the first whole one is a row and column on
+    found = cells.window(Window(1_666_667, 18_666_667, 39, 39))
+    np.testing.assert_allclose(found, 0.07, rtol=0, atol=1e-5)
+
+
 def test_what_is_rough_or_seen_once_says_nothing() -> None:
     rng = np.random.default_rng(3)
     bush = [line(number, 0.0) for number in (1, 2)]
