@@ -15,6 +15,7 @@ from groundproc.cloud.packer import extra_bytes
 from groundproc.cloud.reader import Cloud, opened
 
 _INT32: Final = np.iinfo(np.int32)
+_ANGLE_STEP_DEG: Final = 0.006
 
 
 class Layout:
@@ -93,7 +94,7 @@ class Layout:
         )
         for name in record.point_format.dimension_names:
             if name == "scan_angle_rank":
-                out["scan_angle"] = np.rint(np.asarray(record[name]) / 0.006).astype(np.int16)
+                out["scan_angle"] = angle_of_rank(record[name])
             elif name in self._known:
                 if name in record.array.dtype.names and name in out.array.dtype.names:
                     out.array[name] = record.array[name]
@@ -113,6 +114,11 @@ class Layout:
             if name not in record.point_format.dimension_names:
                 out.array[name] = value
         return out
+
+
+def angle_of_rank(rank_deg: Any) -> npt.NDArray[np.int16]:
+    """The field `scan_angle` of LAS 1.4, in steps of 0.006 deg, of `scan_angle_rank` of point formats 0 to 5, in whole degrees."""
+    return np.rint(np.asarray(rank_deg) / _ANGLE_STEP_DEG).astype(np.int16)
 
 
 def _found(

@@ -8,6 +8,7 @@ import numpy as np
 
 from groundproc.cloud.copc import CopcBuilder
 from groundproc.cloud.exports import Progress
+from groundproc.cloud.layout import angle_of_rank
 from groundproc.cloud.reader import Cloud, chunks, opened
 
 _NEWER: Final = {0: 6, 1: 6, 2: 7, 3: 7, 4: 6, 5: 7, 6: 6, 7: 7, 8: 8, 9: 6, 10: 8}
@@ -26,6 +27,10 @@ def write(cloud: Cloud, path: Path, progress: Progress) -> None:
     by_return = np.zeros(16, np.int64)
     for chunk in chunks(cloud, columns=()):
         record = laspy.PackedPointRecord.from_point_record(chunk.record, header.point_format)
+        if (
+            "scan_angle_rank" in chunk.record.point_format.dimension_names
+        ):  # of another name and step, which laspy does not carry over
+            record["scan_angle"] = angle_of_rank(chunk.record["scan_angle_rank"])
         builder.add(record.array)
         limits[0] = np.minimum(limits[0], chunk.points.xyz_m.min(axis=0))
         limits[1] = np.maximum(limits[1], chunk.points.xyz_m.max(axis=0))

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flightlog.errors import SourceError
-from groundproc.cloud.exports import Progress
+from groundproc.cloud.exports import Progress, colour_bits
 from groundproc.cloud.points import Points
 from groundproc.cloud.reader import Cloud, chunks
 
@@ -27,8 +27,9 @@ def write(cloud: Cloud, path: Path, progress: Progress) -> None:
     try:
         with _opened(path, "" if cloud.crs is None else cloud.crs.to_wkt()) as file:
             scan: _Scan | None = None
+            shift = colour_bits(cloud)
             for chunk in chunks(cloud):
-                fields = _fields(chunk.points)
+                fields = _fields(chunk.points, shift)
                 scan = scan or _Scan(file, fields)
                 scan.write(fields)
                 progress(len(chunk.points))
@@ -59,14 +60,14 @@ def _opened(path: Path, crs: str) -> Any:
     return File(str(path), mode="w")
 
 
-def _fields(points: Points) -> Fields:
-    """What E57 has names for."""
+def _fields(points: Points, shift: int) -> Fields:
+    """What E57 has names for; colours are shifted by so many bits to fit into one byte."""
     found: Fields = {f"cartesian{axis}": points.xyz_m[:, number] for number, axis in enumerate(_AXES)}
     if "intensity" in points:
         found["intensity"] = points["intensity"]
     if "red" in points:
         for name in _COLOURS:
-            found[f"color{name}"] = points[name.lower()] >> 8
+            found[f"color{name}"] = points[name.lower()] >> shift
     return found
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pye57
 import pyproj
 import pytest
+import trimesh
 
 from groundproc.cli import main
 from groundproc.cloud import copc, octree, reader
@@ -60,6 +61,18 @@ def test_a_copc_holds_every_point_and_field_as_two_other_readers_see_it(point_fo
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c.copc.laz", "c.laz"]
 
 
+@pytest.mark.parametrize("point_format", [0, 1, 2, 3])
+def test_a_copc_has_the_scan_angles_of_old_point_formats(point_format: int, tmp_path: Path) -> None:
+    """Whole degrees there, steps of 0.006 deg here (LAS 1.4 R15, tables 7 and 16): as near as these steps come."""
+    source = cloud(tmp_path / "c.las", point_format, 1000)
+    source.scan_angle_rank, source.intensity = np.arange(1000) % 181 - 90, np.arange(1000)
+    source.write(tmp_path / "c.las")
+    assert main(["export", str(tmp_path / "c.las"), "-o", str(tmp_path / "c.copc.laz")]) == 0
+    found = laspy.read(tmp_path / "c.copc.laz")
+    angle_deg = 0.006 * np.asarray(found.scan_angle)[np.argsort(found.intensity)]
+    np.testing.assert_allclose(angle_deg, source.scan_angle_rank, rtol=0, atol=0.003 + 1e-9)
+
+
 def test_a_copc_is_a_laz_file_for_who_knows_no_copc(tmp_path: Path) -> None:
     source = cloud(tmp_path / "c.laz")
     main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.copc.laz")])
@@ -89,6 +102,54 @@ def test_ply_holds_coordinates_in_double_precision_and_the_attributes(tmp_path: 
     np.testing.assert_array_equal(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz)
     np.testing.assert_array_equal(rows["intensity"], source.intensity)
     np.testing.assert_array_equal(rows["red"], np.asarray(source.red) >> 8)
+    np.testing.assert_array_equal(rows["gps_time"], source.gps_time)
+    np.testing.assert_array_equal(rows["theirs"], source.theirs)
+
+
+@pytest.mark.parametrize("most", [255, 65535])
+def test_colours_of_one_byte_are_no_black(most: int, tmp_path: Path) -> None:
+    """Many programs put the byte of a photograph into the two of LAS as it is."""
+    source = cloud(tmp_path / "c.las", 7, 1000)
+    source.red, source.green, source.blue = np.random.default_rng(1).integers(0, most, (3, 1000), endpoint=True)
+    source.green[0] = most
+    source.write(tmp_path / "c.las")
+    for ending in ("ply", "e57"):
+        assert main(["export", str(tmp_path / "c.las"), "-o", str(tmp_path / f"c.{ending}")]) == 0
+    mesh = trimesh.load(tmp_path / "c.ply")
+    with pye57.E57(str(tmp_path / "c.e57")) as file:
+        scan = file.read_scan(0, colors=True, ignore_missing_fields=True)
+    for number, name in enumerate(("red", "green", "blue")):
+        expected = np.asarray(source[name]) // (1 if most == 255 else 256)
+        np.testing.assert_array_equal(mesh.colors[:, number], expected)
+        np.testing.assert_array_equal(scan[f"color{name.title()}"], expected)
+
+
+@pytest.mark.parametrize("ending", ["csv", "ply"])
+def test_extra_bytes_of_any_name_and_shape_are_columns(ending: str, tmp_path: Path) -> None:
+    las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    las.header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams("their own, z", "u2"), laspy.ExtraBytesParams("their_own__z", "i1"),
+            laspy.ExtraBytesParams("normal", "3f4"),
+            laspy.ExtraBytesParams("scaled", "i4", scales=np.array([0.01]), offsets=np.array([5.0])),
+        ]
+    )  # fmt: skip
+    las.points = laspy.ScaleAwarePointRecord.zeros(3, header=las.header)
+    las["their own, z"], las["scaled"] = [1, 2, 65535], [5.01, 4.0, -7.25]
+    las["their_own__z"], las["normal"] = [-1, 0, 9], np.arange(9.0).reshape(3, 3) / 4
+    las.write(tmp_path / "c.las")
+    out = tmp_path / f"c.{ending}"
+    assert main(["export", str(tmp_path / "c.las"), "-o", str(out)]) == 0
+    if ending == "csv":
+        read = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
+        rows = {name: read[name] for name in read.dtype.names}
+    else:
+        rows = trimesh.load(out).metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(rows["their_own__z"], [1, 2, 65535])
+    np.testing.assert_array_equal(rows["their_own__z_2"], [-1, 0, 9])
+    np.testing.assert_allclose(rows["scaled"], [5.01, 4.0, -7.25], rtol=0, atol=1e-12)
+    for part in range(3):
+        np.testing.assert_array_equal(rows[f"normal_{part}"], np.arange(9.0).reshape(3, 3)[:, part] / 4)
 
 
 def test_csv_has_a_header_and_digits_enough(tmp_path: Path) -> None:
@@ -98,6 +159,20 @@ def test_csv_has_a_header_and_digits_enough(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), source.xyz, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(rows["classification"], source.classification)
     np.testing.assert_allclose(rows["gps_time"], source.gps_time, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rows["theirs"], source.theirs, rtol=1e-14)
+
+
+def test_csv_of_degrees_keeps_every_step(tmp_path: Path) -> None:
+    """A thousandth of a degree is a hundred metres."""
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [1e-8, 1e-8, 0.001], [9.0, 50.0, 0.0]
+    header.add_crs(pyproj.CRS.from_epsg(4326))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.random.default_rng(1).uniform([9.0, 50.0, 100.0], [9.001, 50.001, 101.0], (100, 3)).T
+    las.write(tmp_path / "c.laz")
+    assert main(["export", str(tmp_path / "c.laz"), "-o", str(tmp_path / "c.csv")]) == 0
+    rows = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), las.xyz, rtol=0, atol=1e-9)
 
 
 def test_a_crowd_that_no_node_can_take_is_refused_with_file_and_place(

@@ -73,7 +73,9 @@ def test_points_on_the_edges_of_cells_lie_where_their_cells_are() -> None:
     cells = LineDifferences(0.3)
     for number in (1, 2):
         lifted = xyz + [0.0, 0.0, 0.07 * (number - 1)]
-        cells.add(Points(np.zeros(len(xyz), np.int64), lifted, {"point_source_id": np.full(len(xyz), number, np.uint16)}))
+        cells.add(
+            Points(np.zeros(len(xyz), np.int64), lifted, {"point_source_id": np.full(len(xyz), number, np.uint16)})
+        )
     # 500,000 m are 1,666,666 cells and two thirds, 5,600,000 m are 18,666,666 and two thirds: the first whole one is a row and column on
     found = cells.window(Window(1_666_667, 18_666_667, 39, 39))
     np.testing.assert_allclose(found, 0.07, rtol=0, atol=1e-5)
