@@ -5,7 +5,7 @@ the polygon. Uncertainty has two parts: the base, whose error acts on the whole 
 the points, which averages out.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -286,6 +286,10 @@ def coverage(polygon: Any, grid: Grid) -> Array:
     return np.asarray(share.reshape(grid.rows, grid.columns))
 
 
-def polygons_of(geometries: Iterable[Any]) -> list[Any]:
-    """Plain polygons; a multiple one has to be a single one in truth."""
-    return [each.geoms[0] if each.geom_type == "MultiPolygon" and len(each.geoms) == 1 else each for each in geometries]
+def together(parts: Sequence[Volume]) -> Volume:
+    """Several parts of one thing: their errors have nothing to do with each other, as far as each has a base of its own."""
+    return Volume(
+        sum(each.cut_m3 for each in parts), sum(each.fill_m3 for each in parts),
+        float(np.linalg.norm([each.sigma_m3 for each in parts])), sum(each.area_m2 for each in parts),
+        sum(each.empty_m2 for each in parts),
+    )  # fmt: skip

@@ -3,8 +3,10 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+_MUCH_EMPTY: Final = 0.1
+"""Share of a polygon without points from which on it is said on the terminal: the sigma does not know what lies there."""
 HELP = "measure volumes of a cloud within polygons: cut, fill, net, each with its sigma"
 
 
@@ -31,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from flightlog.errors import UsageError
     from groundproc.analysis import volumes
+    from groundproc.commands.figures import warn
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
     from groundproc.commands.outputs import claim_file
     from groundproc.files import written_aside
@@ -45,15 +48,23 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         claim_file(arguments.json, (".json",), arguments.force)
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
-        found, cloud = volumes.measure(arguments.cloud, arguments.polygons, base, bar.update)
+        found = volumes.measure(arguments.cloud, arguments.polygons, base, bar.update)
+    warn(found.warnings, sys.stderr)
     rows: list[dict[str, Any]] = []
     unmeasured = []
-    for each in found:
+    for each in found.polygons:
         one = each.volume
         if one is None:
             unmeasured.append({"id": each.id, "reason": each.reason})
             print(f"swath: warning: polygon {each.id} is not measured: {each.reason}", file=sys.stderr)
             continue
+        if one.empty_m2 > _MUCH_EMPTY * one.area_m2:
+            warn(
+                [
+                    f"polygon {each.id}: {one.empty_m2:.2f} of {one.area_m2:.2f} m2 hold no points, and were interpolated"
+                ],
+                sys.stderr,
+            )
         rows.append(
             {
                 "id": each.id, "cut_m3": one.cut_m3, "fill_m3": one.fill_m3, "net_m3": one.net_m3, "sigma_m3": one.sigma_m3,
@@ -63,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         told = {
             "base": base,
-            "crs": None if cloud.crs is None else cloud.crs.name,
+            "crs": None if found.cloud.crs is None else found.cloud.crs.name,
             "polygons": rows,
             "unmeasured": unmeasured,
         }

@@ -111,6 +111,90 @@ def test_a_raster_is_a_base_too(tmp_path: Path) -> None:
     assert found["heap"]["net_m3"] == pytest.approx(CONE_M3, rel=0.005)
 
 
+def in_feet(path: Path, epsg: int) -> Path:
+    """The scene in feet of the US survey, its figures as they are in metres."""
+    foot_m = 1200 / 3937
+    las = laspy.read(scene(path))
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, np.floor(las.header.offsets / foot_m)
+    header.add_crs(pyproj.CRS.from_epsg(epsg))
+    feet = laspy.LasData(header)
+    feet.xyz = las.xyz / foot_m
+    feet.write(path)
+    return path
+
+
+@pytest.mark.parametrize("base", ["toe", "plane", "dtm", "base.tif"])
+def test_a_cloud_in_feet_has_its_volume_in_cubic_metres(base: str, tmp_path: Path) -> None:
+    """A cubic metre is 35.3 cubic feet. North Carolina's plane (EPSG 2264) is in feet, and so are polygons and raster in it."""
+    foot_m, cell = 1200 / 3937, 2.0
+    cloud = in_feet(tmp_path / "c.laz", 2264)
+    shape = shapely.transform(HEAP, lambda xy: (xy + ORIGIN) / foot_m)
+    pyogrio.raw.write(
+        tmp_path / "p.gpkg", shapely.to_wkb(np.array([shape])), [np.array(["heap"], object)], ["id"], geometry_type="Polygon",
+        crs="EPSG:2264",
+    )  # fmt: skip
+    corner = np.floor(ORIGIN / foot_m / cell) * cell + [0.0, 140.0]
+    j, i = np.mgrid[:70, :100]
+    east_m, north_m = (corner[0] + (i + 0.5) * cell) * foot_m, (corner[1] - (j + 0.5) * cell) * foot_m
+    with rasterio.open(
+        tmp_path / "base.tif", "w", driver="GTiff", width=100, height=70, count=1, dtype="float32", crs="EPSG:2264",
+        transform=from_origin(*corner, cell, cell),
+    ) as file:  # fmt: skip
+        file.write((ground(east_m - ORIGIN[0], north_m - ORIGIN[1]) / foot_m).astype(np.float32), 1)
+    if base == "dtm":  # what is bare ground is said: a heap of earth is ground itself
+        las = laspy.read(cloud)
+        away = np.hypot(*((np.asarray(las.xyz)[:, :2] * foot_m - ORIGIN - 20.0).T)) > 8.0
+        las.classification = np.where(away, 2, 1)
+        las.write(cloud)
+    found = measured(tmp_path, cloud, tmp_path / "p.gpkg", "--base", tmp_path / base if base.endswith("tif") else base)[
+        "heap"
+    ]
+    assert found["net_m3"] == pytest.approx(CONE_M3, rel=0.02)
+    assert found["area_m2"] == pytest.approx(HEAP.area, rel=1e-3)
+
+
+def test_parts_of_one_thing_are_measured_together(tmp_path: Path) -> None:
+    """Two heaps that are one polygon in a file of a GIS."""
+    both = shapely.MultiPolygon([HEAP, PIT])
+    areas = tmp_path / "p.gpkg"
+    pyogrio.raw.write(
+        areas, shapely.to_wkb(np.array([shapely.transform(both, lambda xy: xy + ORIGIN)])), [np.array(["both"], object)], ["id"],
+        geometry_type="MultiPolygon", crs="EPSG:32633",
+    )  # fmt: skip
+    cloud = scene(tmp_path / "c.laz")
+    found = measured(tmp_path, cloud, areas)["both"]
+    apart = measured(tmp_path, cloud, polygons(tmp_path / "q.gpkg", {"heap": HEAP, "pit": PIT}))
+    assert found["net_m3"] == pytest.approx(CONE_M3 - PIT_M3, abs=3.0 * found["sigma_m3"])
+    assert found["area_m2"] == pytest.approx(both.area, rel=1e-3)
+    assert found["sigma_m3"] == pytest.approx(math.hypot(apart["heap"]["sigma_m3"], apart["pit"]["sigma_m3"]))
+
+
+def test_a_base_in_another_crs_is_refused_and_what_states_none_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud, areas = scene(tmp_path / "c.laz"), polygons(tmp_path / "p.gpkg", {"heap": HEAP})
+    for crs in ("EPSG:32634", None):
+        with rasterio.open(
+            tmp_path / "base.tif", "w", driver="GTiff", width=60, height=40, count=1, dtype="float32", crs=crs,
+            transform=from_origin(ORIGIN[0], ORIGIN[1] + 40.0, 1.0, 1.0),
+        ) as file:  # fmt: skip
+            file.write(np.full((40, 60), 50.0, np.float32), 1)
+        done = main(["volume", str(cloud), str(areas), "--base", str(tmp_path / "base.tif")])
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert (done, "UTM zone 34N" in said, "base.tif states no CRS" in said) == (
+            (0, False, True) if crs is None else (1, True, False)
+        )
+
+
+def test_a_polygon_half_without_points_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    areas = polygons(tmp_path / "p.gpkg", {"half": shapely.box(48, 10, 68, 30)})
+    found = measured(tmp_path, scene(tmp_path / "c.laz"), areas)["half"]
+    assert found["empty_m2"] == pytest.approx(160.0, rel=0.05)
+    assert "polygon half: " in capsys.readouterr().err
+
+
 def test_a_polygon_beyond_the_cloud_is_named_and_the_others_are_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
