@@ -72,7 +72,7 @@ def test_points_on_the_edges_of_cells_lie_where_their_cells_are() -> None:
     xyz = np.stack([500_000.0 + 0.1 * east, 5_600_000.0 + 0.1 * north, 50.0 + 0.05 * east + 0.03 * north], axis=1)
     cells = LineDifferences(0.3)
     for number in (1, 2):
-        lifted = xyz + [0.0, 0.0, 0.07 * (number - 1)]
+        lifted = xyz + np.array([0.0, 0.0, 0.07 * (number - 1)])
         cells.add(
             Points(np.zeros(len(xyz), np.int64), lifted, {"point_source_id": np.full(len(xyz), number, np.uint16)})
         )
