@@ -12,6 +12,7 @@ import shapely
 from flightlog.errors import CoverageError, UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.classes import NO_SURFACE
+from groundproc.cloud.metres import METRES, Metres, metres_in, metres_of
 from groundproc.raster import geotiff
 from groundproc.raster.sampling import heights_at
 
@@ -32,12 +33,15 @@ class Line:
     along_m : ndarray, shape (m,)
         Ways from its beginning to the stations.
     stations_m : ndarray, shape (m, 2)
+    unit : Metres
+        Of the CRS that the line was given in.
     """
 
     name: str
     places_m: Array
     along_m: Array
     stations_m: Array
+    unit: Metres = METRES
 
 
 @dataclass(slots=True)
@@ -65,20 +69,23 @@ class Profile:
     count: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
 
-def line_of(name: str, places_m: Array, step_m: float) -> Line:
+def line_of(name: str, places: Array, step_m: float, unit: Metres = METRES) -> Line:
     """A line with stations a step apart, and one at its end.
 
     Parameters
     ----------
     name : str
-    places_m : ndarray, shape (n, 2)
+    places : ndarray, shape (n, 2)
+        In a unit.
     step_m : float
+    unit : Metres
 
     Raises
     ------
     UsageError
         No length, no step, or too many stations.
     """
+    places_m = places * unit.across
     shape = shapely.LineString(places_m) if len(places_m) > 1 else None
     length = 0.0 if shape is None else float(shape.length)
     if not (length > 0.0 and step_m > 0.0):
@@ -90,7 +97,7 @@ def line_of(name: str, places_m: Array, step_m: float) -> Line:
             f"line {name}: {length / step_m:,.0f} stations, expected at most {MOST_STATIONS:,}; take larger steps"
         )
     along = np.append(np.arange(0.0, length - 1e-9 * length, step_m), length)
-    return Line(name, places_m, along, shapely.get_coordinates(shapely.line_interpolate_point(shape, along)))
+    return Line(name, places_m, along, shapely.get_coordinates(shapely.line_interpolate_point(shape, along)), unit)
 
 
 def of_raster(path: Path, lines: Sequence[Line]) -> list[Profile]:
@@ -102,7 +109,13 @@ def of_raster(path: Path, lines: Sequence[Line]) -> list[Profile]:
         It cannot be read.
     """
     with geotiff.opened(path) as raster:
-        return [Profile(line, path.name, heights_at(raster, line.stations_m)) for line in lines]
+        unit = line_unit(lines) if raster.crs is None else metres_in(raster.crs)
+        return [Profile(line, path.name, unit.up * heights_at(raster, line.stations_m / unit.across)) for line in lines]
+
+
+def line_unit(lines: Sequence[Line]) -> Metres:
+    """What a file that states no CRS counts in: the unit of the lines."""
+    return lines[0].unit if lines else METRES
 
 
 def of_cloud(
@@ -130,13 +143,14 @@ def of_cloud(
     if not width_m > 0.0:
         raise UsageError(f"--width {width_m:g}: expected more than 0")
     cloud = reader.look(path)
+    unit = line_unit(lines) if cloud.crs is None else metres_of(cloud)
     classed = "classification" in cloud.columns
     if classes is not None and not classed:
         raise CoverageError(f"{path}: its points have no classes, expected classes {', '.join(map(str, classes))}")
     sums = [_Sums(line) for line in lines]
     present = np.zeros(256, np.bool_)
     for chunk in reader.chunks(cloud, columns=("classification",) if classed else ()):
-        xyz = chunk.points.xyz_m
+        xyz = unit.of(chunk.points.xyz_m)
         if classed:
             kind = chunk.points["classification"]
             present[kind] = True

@@ -39,7 +39,10 @@ def write_csv(path: Path, profiles: Sequence[Profile]) -> None:
             for each in profiles:
                 line = each.line
                 rest = (each.lowest_m, each.highest_m, each.sigma_m) if len(each.count) else ()
-                columns = [_texts(values, 4) for values in (line.along_m, *line.stations_m.T, each.height_m, *rest)]
+                columns = [
+                    _texts(values, 4)
+                    for values in (line.along_m, *(line.stations_m / line.unit.across).T, each.height_m, *rest)
+                ]
                 columns += [[""] * len(line.along_m)] * (7 - len(columns))
                 counts = [str(n) for n in each.count.tolist()] or [""] * len(line.along_m)
                 table.writerows(

@@ -58,6 +58,13 @@ class Metres:
         """The CRS is in metres."""
         return self.across == self.up == 1.0
 
+    @property
+    def height_word(self) -> str:
+        """The unit of heights as names of columns and tables have it."""
+        if self.up == 1.0:
+            return "m"
+        return "ft" if abs(self.up - 0.3048) < 1e-6 else f"{self.up:.9g}m"
+
     def of(self, xyz: Array) -> Array:
         """Coordinates of the CRS in metres, shape (n, 3) or (3,)."""
         return xyz if self.plain else xyz * (self.across, self.across, self.up)

@@ -7,6 +7,7 @@ from pathlib import Path
 from flightlog.errors import UsageError
 from groundproc.cloud import reader
 from groundproc.cloud.layout import Layout
+from groundproc.cloud.metres import agreed_metres
 from groundproc.cloud.reader import Cloud
 from groundproc.cloud.tiling import INDEX, Tile, Tiling
 from groundproc.cloud.vpc import write_vpc
@@ -32,14 +33,17 @@ def tile_clouds(
     ------
     UsageError
         The folder holds files, or the size is none.
+    GeodesyError
+        Coordinates are angles.
     CaptureError, SourceError
         A cloud cannot be read, or a tile cannot be written.
     """
     _claim(folder, force, [cloud.path for cloud in clouds])
+    unit = agreed_metres(clouds)
     with written_folder(folder, INDEX, _named(folder / INDEX)) as aside:
         layout = Layout(clouds)
         header = layout.header()
-        tiling = Tiling(header, aside, size_m)
+        tiling = Tiling(header, aside, size_m, unit.across)
         for cloud in clouds:
             for chunk in reader.chunks(cloud, columns=()):
                 tiling.add(layout.laid(chunk.record).array)

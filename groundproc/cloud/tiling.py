@@ -35,7 +35,7 @@ class Tile:
     Attributes
     ----------
     square : str
-        West and south edge of the square [m].
+        West and south edge of the square, in the unit of the CRS.
     name : str
         Of the file.
     points : int
@@ -66,6 +66,8 @@ class Tiling:
     folder : Path
         For temporary files.
     size_m : float
+    unit_m : float
+        Of the points' coordinates.
 
     Raises
     ------
@@ -73,10 +75,11 @@ class Tiling:
         The size is none.
     """
 
-    def __init__(self, header: laspy.LasHeader, folder: Path, size_m: float) -> None:
+    def __init__(self, header: laspy.LasHeader, folder: Path, size_m: float, unit_m: float = 1.0) -> None:
         if not SMALLEST_M <= size_m <= LARGEST_M:
             raise UsageError(f"tiles of {size_m:g} m: expected {SMALLEST_M:g} to {LARGEST_M:g} m, such as 250")
-        self._header, self._folder, self._size_m = header, folder, size_m
+        self._header, self._folder, self._unit_m = header, folder, unit_m
+        self._size_m, self._size = size_m, size_m / unit_m
         self._spool = Spool(header.point_format.dtype(), folder)
 
     def add(self, records: Records) -> None:
@@ -111,7 +114,11 @@ class Tiling:
             Told of points done.
         """
         places = sorted(self._spool.counts, key=lambda place: (place[1], place[0]))
-        overview = _Overview(self._header, self._folder, len(places) * self._size_m**2) if len(places) > 1 else None
+        overview = (
+            _Overview(self._header, self._folder, len(places) * self._size_m**2, self._unit_m)
+            if len(places) > 1
+            else None
+        )
         tiles = [self._write_tile(folder, place, form, overview, progress) for place in places]
         if overview is not None:
             overview.write(folder / OVERVIEW)
@@ -120,7 +127,7 @@ class Tiling:
     def _write_tile(
         self, folder: Path, place: Place, form: str, overview: "_Overview | None", progress: Callable[[int], object]
     ) -> Tile:
-        square = "_".join(f"{each * self._size_m:.10g}" for each in place)
+        square = "_".join(f"{each * self._size:.10g}" for each in place)
         path = folder / f"{square}{FORMATS[form]}"
         writer = (_Copc if form == "copc" else _Laz)(self._header, path, self._folder)
         totals = _Totals(self._header)
@@ -139,7 +146,7 @@ class Tiling:
     def _squares(self, records: Records, axis: int) -> Array:
         """Places in squares along an axis; what differs from an edge by less than any step lies on it."""
         place = records["XYZ"[axis]] * self._header.scales[axis] + self._header.offsets[axis]
-        return np.asarray(np.round(place / self._size_m, 9))
+        return np.asarray(np.round(place / self._size, 9))
 
 
 class _Totals:
@@ -216,17 +223,17 @@ class _Laz:
 class _Overview:
     """A few points of all tiles: the first in each cube of space, the cubes as large as it takes for a million of level ground."""
 
-    def __init__(self, header: laspy.LasHeader, folder: Path, area_m2: float) -> None:
+    def __init__(self, header: laspy.LasHeader, folder: Path, area_m2: float, unit_m: float) -> None:
         self._header = copy.deepcopy(header)
         self._builder, self._totals = CopcBuilder(self._header, folder), _Totals(header)
-        self._cube_m = max(_FINEST_M, float(np.sqrt(area_m2 / _OVERVIEW_POINTS)))
+        self._cube = max(_FINEST_M, float(np.sqrt(area_m2 / _OVERVIEW_POINTS))) / unit_m
         self._seen = np.empty(0, np.int64)
 
     def add(self, records: Records) -> None:
         """Take what is in a cube of this tile that had no point yet."""
         scales, offsets = self._header.scales, self._header.offsets
         cube = [
-            np.floor((records[n] * scales[a] + offsets[a]) / self._cube_m).astype(np.int64) & 0x1FFFFF
+            np.floor((records[n] * scales[a] + offsets[a]) / self._cube).astype(np.int64) & 0x1FFFFF
             for a, n in enumerate("XYZ")
         ]
         keys, first = np.unique(cube[0] | cube[1] << 21 | cube[2] << 42, return_index=True)

@@ -81,10 +81,12 @@ def _profiles(arguments: argparse.Namespace) -> "list[Profile]":
 
     from flightlog.errors import CoverageError
     from groundproc.analysis import profile
+    from groundproc.cloud.metres import flat
     from groundproc.commands.values import classes
 
     chosen = None if arguments.classes is None else classes(arguments.classes, "--classes")
     crs = _crs(arguments.sources)
+    flat(arguments.sources[0], crs)
     lines = _lines(arguments, crs)
     found: list[Profile] = []
     with tqdm(unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty()) as bar:
@@ -145,16 +147,18 @@ def _lines(arguments: argparse.Namespace, crs: "pyproj.CRS | None") -> "list[Lin
 
     from flightlog.errors import UsageError
     from groundproc.analysis.profile import line_of
+    from groundproc.cloud.metres import metres_in
     from groundproc.commands.values import numbers
     from groundproc.vectors.features import names_of, read_features
 
+    unit = metres_in(crs)
     if arguments.line is not None:
         values = numbers(arguments.line, "--line", None, "E,N,E,N")
         if len(values) < 4 or len(values) % 2:
             raise UsageError(
                 f"--line {arguments.line}: {len(values)} numbers found, expected E,N of two corners and more"
             )
-        return [line_of("line", np.array(values).reshape(-1, 2), arguments.step)]
+        return [line_of("line", np.array(values).reshape(-1, 2), arguments.step, unit)]
     features = read_features(arguments.lines, "LineString")
     if crs is not None and features.crs is not None:
         features = features.into(crs)
@@ -164,7 +168,7 @@ def _lines(arguments: argparse.Namespace, crs: "pyproj.CRS | None") -> "list[Lin
         parts = shapely.get_parts(shape)
         for number, part in enumerate(parts, 1):
             called = name if len(parts) == 1 else f"{name}.{number}"
-            found.append(line_of(called, shapely.get_coordinates(part), arguments.step))
+            found.append(line_of(called, shapely.get_coordinates(part), arguments.step, unit))
     return found
 
 

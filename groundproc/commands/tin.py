@@ -28,6 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from groundproc.analysis.tin import tin
+    from groundproc.cloud.metres import flat, metres_in
     from groundproc.commands.inputs import RASTER, RASTER_WORDS, expect
     from groundproc.commands.outputs import claim_file, write_json
     from groundproc.files import written_aside
@@ -42,13 +43,14 @@ def run(arguments: argparse.Namespace) -> int:
         claim_file(arguments.json, (".json",), arguments.force)
     bar = tqdm(total=100, unit="%", leave=False, disable=not sys.stderr.isatty())
     with geotiff.opened(arguments.raster) as raster, bar:
+        flat(arguments.raster, raster.crs)
         made = tin(raster, arguments.tolerance, lambda share: bar.update(100.0 * share - bar.n))
         crs = raster.crs
     if crs is None:
         print(f"swath: warning: {arguments.raster} states no CRS, and so {output} states none", file=sys.stderr)
     with written_aside(output) as aside:
         if output.suffix.lower() == ".dxf":
-            write_faces(aside, made.places, made.triangles, "TIN")
+            write_faces(aside, made.places, made.triangles, "TIN", metres_in(crs).across)
         else:
             write_surface(aside, made.places, made.triangles, arguments.raster.stem, crs)
     if arguments.json is not None:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -41,8 +41,20 @@ class Label:
     layer: str
 
 
-def write_dxf(path: Path, lines: Sequence[Line], labels: Sequence[Label] = ()) -> None:
-    """Write a drawing in metres, in place (the caller writes aside).
+_UNITS: Final = {1.0: 6, 0.3048: 2, 0.304801: 21}
+"""$INSUNITS of the format, by metres in a unit to a millionth: metres, feet, feet of the US survey; 0 is none that is said."""
+
+
+def write_dxf(path: Path, lines: Sequence[Line], labels: Sequence[Label] = (), unit_m: float = 1.0) -> None:
+    """Write a drawing, in place (the caller writes aside).
+
+    Parameters
+    ----------
+    path : Path
+    lines : sequence of Line
+    labels : sequence of Label
+    unit_m : float
+        What their numbers count [m].
 
     Raises
     ------
@@ -51,7 +63,7 @@ def write_dxf(path: Path, lines: Sequence[Line], labels: Sequence[Label] = ()) -
     """
     from ezdxf.enums import TextEntityAlignment
 
-    drawing, space = _new({each.layer for each in lines} | {each.layer for each in labels})
+    drawing, space = _new({each.layer for each in lines} | {each.layer for each in labels}, unit_m)
     for line in lines:
         attributes = {"layer": line.layer}
         if line.places_m.shape[1] == 2:
@@ -66,24 +78,26 @@ def write_dxf(path: Path, lines: Sequence[Line], labels: Sequence[Label] = ()) -
     _write(path, drawing)
 
 
-def write_faces(path: Path, places_m: Array, triangles: npt.NDArray[np.int64], layer: str) -> None:
+def write_faces(path: Path, places: Array, triangles: npt.NDArray[np.int64], layer: str, unit_m: float = 1.0) -> None:
     """Write triangles as 3D faces, in place (the caller writes aside).
 
     Parameters
     ----------
     path : Path
-    places_m : ndarray, shape (n, 3)
+    places : ndarray, shape (n, 3)
     triangles : ndarray of int64, shape (m, 3)
-        Rows of `places_m`.
+        Rows of `places`.
     layer : str
+    unit_m : float
+        What the places count [m].
 
     Raises
     ------
     SourceError
         It cannot be written.
     """
-    drawing, space = _new({layer})
-    for corners in places_m[triangles].tolist():
+    drawing, space = _new({layer}, unit_m)
+    for corners in places[triangles].tolist():
         space.add_3dface(corners, dxfattribs={"layer": layer})
     _write(path, drawing)
 
@@ -102,13 +116,12 @@ def write_places(path: Path, places_m: Array, layers: Sequence[str]) -> None:
     _write(path, drawing)
 
 
-def _new(layers: Iterable[str]) -> tuple[Any, Any]:
-    """An empty drawing in metres, and where its entities go."""
-    from ezdxf import units
+def _new(layers: Iterable[str], unit_m: float = 1.0) -> tuple[Any, Any]:
+    """An empty drawing, and where its entities go."""
     from ezdxf.document import Drawing
 
     drawing = Drawing.new("R2010")
-    drawing.units = units.M
+    drawing.units = _UNITS.get(round(unit_m, 6), 0)
     for layer in sorted(layers):
         drawing.layers.add(layer)
     return drawing, drawing.modelspace()

@@ -1,15 +1,20 @@
 """Clouds in feet: what the commands find of a place is what they find of it in metres, and lies where it lies in feet."""
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
 
+import ezdxf
 import laspy
 import numpy as np
 import numpy.typing as npt
+import pyogrio
 import pyproj
 import pytest
 import rasterio
+import shapely
+from rasterio.transform import from_origin
 
 from groundproc.cli import main
 
@@ -121,3 +126,57 @@ def test_widths_cells_and_ways_are_in_metres(place: Path, tmp_path: Path) -> Non
             assert raster.units[0] == unit
             values = raster.read(1, masked=True).compressed()
         assert least < values.mean() < most
+
+
+def test_contours_stand_at_whole_feet_and_say_so(tmp_path: Path) -> None:
+    """A slope of one foot in ten to the east: the line of 105 ft runs 50 ft east of that of 100 ft."""
+    west, north = np.round(ORIGIN_M[:2] / FOOT_M)
+    with rasterio.open(
+        tmp_path / "d.tif", "w", driver="GTiff", width=200, height=50, count=1, dtype="float32", crs=f"EPSG:{FEET}",
+        transform=from_origin(west, north, 1.0, 1.0),
+    ) as file:  # fmt: skip
+        file.write(np.tile((100.0 + (np.arange(200) + 0.5) / 10).astype(np.float32), (50, 1)), 1)
+    _swath("contours", tmp_path / "d.tif", "--interval", "1", "--shortest", "14", "-o", tmp_path / "c.gpkg")
+    meta, _, wkb, fields = pyogrio.raw.read(tmp_path / "c.gpkg")
+    columns = dict(zip(meta["fields"], fields, strict=True))
+    assert set(columns) == {"height_ft", "index", "length_m"}
+    np.testing.assert_array_equal(columns["height_ft"], np.arange(101.0, 120.0))
+    np.testing.assert_allclose(columns["length_m"], 49 * FOOT_M, rtol=0, atol=1e-6)
+    for line, height in zip(shapely.from_wkb(wkb), columns["height_ft"], strict=True):
+        np.testing.assert_allclose(shapely.get_coordinates(line)[:, 0], west + 10 * (height - 100), rtol=0, atol=1e-3)
+    _swath("contours", tmp_path / "d.tif", "--interval", "1", "-o", tmp_path / "c.dxf")
+    _swath("tin", tmp_path / "d.tif", "-o", tmp_path / "t.dxf")
+    drawn = ezdxf.readfile(tmp_path / "c.dxf")
+    assert [each.dxf.height * FOOT_M for each in drawn.modelspace().query("TEXT")] == pytest.approx([0.5] * 3)
+    assert {drawn.units, ezdxf.readfile(tmp_path / "t.dxf").units} == {ezdxf.enums.InsertUnits.USSurveyFeet}
+
+
+def test_a_profile_of_feet_is_in_metres_as_its_columns_say(place: Path, tmp_path: Path) -> None:
+    _swath("raster", place / "a_ft.laz", "--cell", "0.5", "--statistic", "mean", "-o", tmp_path / "d.tif")
+    east, north = ORIGIN_M[:2] / FOOT_M
+    line = f"{east + 2 / FOOT_M},{north + 12 / FOOT_M},{east + 22 / FOOT_M},{north + 12 / FOOT_M}"
+    sources = (tmp_path / "d.tif", place / "a_ft.laz")
+    _swath("profile", *sources, "--line", line, "--step", "1", "-o", tmp_path / "p.csv")
+    with (tmp_path / "p.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["source"] for row in rows] == ["d.tif"] * 21 + ["a_ft.laz"] * 21
+    for row in rows:
+        along = float(row["along_m"])
+        x = 2.0 + along
+        assert along == pytest.approx(round(along), abs=1e-3)
+        assert float(row["easting"]) == pytest.approx(east + x / FOOT_M, abs=1e-3)
+        # the wave rises by 0.28 in a metre, and a station stands for what is half a metre around it
+        expected = 50.0 + 0.08 * x + 0.6 * np.sin(4.0) + 0.4 * np.sin(x / 2)
+        assert float(row["height_m"]) == pytest.approx(expected, abs=0.15)
+
+
+def test_tiles_are_metres_wide(place: Path, tmp_path: Path) -> None:
+    _swath("tile", place / "a_ft.laz", "--size", "8", "-o", tmp_path / "tiles")
+    found = [path for path in (tmp_path / "tiles").glob("*.copc.laz") if path.name != "overview.copc.laz"]
+    for path in found:
+        corner_m = np.array([float(each) for each in path.name.removesuffix(".copc.laz").split("_")]) * FOOT_M
+        np.testing.assert_allclose(corner_m, np.round(corner_m / 8) * 8, rtol=0, atol=1e-3)
+        within = np.asarray(laspy.read(path).xyz)[:, :2] * FOOT_M - corner_m
+        assert within.min() > -1e-3
+        assert within.max() < 8.001
+    assert len(found) >= 9
