@@ -30,6 +30,8 @@ NO_DATA: Final = -9999.0
 _TROUBLE: Final = (RasterioError, CPLE_BaseError, OSError)
 _FARTHEST_M: Final = 1e5
 """Heights on the earth, in metres or feet, lie well within."""
+_NONE_THERE: Final = (-9999.0, -32767.0, -32768.0)
+"""What programs put where there is no height; a file that does not say so has pits as deep."""
 _FARTHEST_PLACE_M: Final = 1e8
 _CELL_M: Final = 1e-3, 1e5
 
@@ -173,6 +175,11 @@ class Raster:
             raise CaptureError(
                 f"{self.path}: values such as {largest:g} found, expected heights within {_FARTHEST_M:g} m; does it not state which "
                 "value stands for none?"
+            )
+        if self.file.nodata is None and (silent := [v for v in _NONE_THERE if (found == v).any()]):
+            raise CaptureError(
+                f"{self.path}: heights of {silent[0]:g} found, which stand for none, but the file does not say so; gdal_translate "
+                f"-a_nodata {silent[0]:g} makes one that does"
             )
         found[np.isnan(found)] = np.nan  # without the bits that make arithmetic complain
         return found

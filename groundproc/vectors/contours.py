@@ -18,6 +18,7 @@ INDEX: Final = 5
 """Every fifth line is an index contour."""
 MOST_CELLS: Final = 400_000_000
 _MOST_LINES: Final = 100_000
+_DIGITS: Final = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,10 @@ def contours(raster: Raster, interval: float, shortest: float = 0.0) -> Iterator
         raise CoverageError(
             f"{raster.path}: {grid.columns} x {grid.rows} cells, expected at most {MOST_CELLS:,}; choose larger cells"
         )
+    if min(grid.columns, grid.rows) < 2:
+        raise CoverageError(
+            f"{raster.path}: {grid.columns} x {grid.rows} cells, expected two or more each way: lines run between their centres"
+        )
     heights = raster.window(grid)
     if not np.isfinite(heights).any():
         raise CoverageError(f"{raster.path}: no height is known")
@@ -89,7 +94,8 @@ def contours(raster: Raster, interval: float, shortest: float = 0.0) -> Iterator
     y = raster.north_m - (np.arange(grid.rows) + 0.5) * grid.cell_m
     generator = contour_generator(x, y, np.ma.masked_invalid(heights), name="serial", chunk_size=0)
     for step in range(first, last + 1):
-        for places in generator.lines(step * interval):
-            line = Contour(step * interval, np.asarray(places), step % INDEX == 0)
+        height = round(step * interval, _DIGITS)  # three times 0.3 is 0.9 for people
+        for places in generator.lines(height):
+            line = Contour(height, np.asarray(places), step % INDEX == 0)
             if len(line.places) > 1 and line.length >= shortest:
                 yield line

@@ -51,6 +51,50 @@ def test_contours_of_a_cone_are_circles_of_its_height(name: str, tmp_path: Path)
     assert len(index)
 
 
+def test_heights_are_numbers_as_people_write_them(tmp_path: Path) -> None:
+    """Three times 0.3 is 0.8999999999999999 in double precision, and would be a label of that length."""
+    main(["contours", str(cone(tmp_path / "d.tif")), "--interval", "0.3", "-o", str(tmp_path / "c.gpkg")])
+    for height in lines(tmp_path / "c.gpkg")[1]["height_m"].tolist():
+        assert height == float(f"{height:.1f}")
+
+
+@pytest.mark.parametrize("none", [-9999.0, -32768.0])
+@pytest.mark.parametrize("command", ["contours", "tin", "profile"])
+def test_a_raster_that_does_not_say_what_stands_for_none_is_refused(
+    command: str, none: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with rasterio.open(cone(tmp_path / "d.tif", hole=True)) as file:
+        heights, profile = file.read(1), file.profile
+    profile["nodata"] = None
+    with rasterio.open(tmp_path / "d.tif", "w", **profile) as file:
+        file.write(np.where(heights == -9999.0, np.float32(none), heights), 1)
+    words = {
+        "contours": ["-o", "c.gpkg"], "tin": ["-o", "t.xml"],
+        "profile": ["--line", f"{WEST + 1},{NORTH - 50},{WEST + 99},{NORTH - 50}", "-o", "p.csv"],
+    }[command]  # fmt: skip
+    words[-1] = str(tmp_path / words[-1])
+    assert main([command, str(tmp_path / "d.tif"), *words]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"gdal_translate -a_nodata {none:g}" in said
+    assert [each.name for each in tmp_path.iterdir()] == ["d.tif"]
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(1, 1), (1, 50), (50, 1)])
+def test_one_row_of_cells_has_no_contour(
+    columns: int, rows: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with rasterio.open(
+        tmp_path / "d.tif", "w", driver="GTiff", width=columns, height=rows, count=1, dtype="float32", crs="EPSG:32633",
+        transform=from_origin(WEST, NORTH, CELL, CELL),
+    ) as file:  # fmt: skip
+        file.write(np.linspace(1.0, 9.0, columns * rows).astype(np.float32).reshape(rows, columns), 1)
+    assert main(["contours", str(tmp_path / "d.tif"), "-o", str(tmp_path / "c.gpkg")]) == 1
+    assert capsys.readouterr().err == (
+        f"swath: {tmp_path / 'd.tif'}: {columns} x {rows} cells, expected two or more each way: lines run between their centres\n"
+    )
+
+
 def test_a_drawing_has_heights_layers_and_labels(tmp_path: Path) -> None:
     main(["contours", str(cone(tmp_path / "d.tif")), "--interval", "5", "-o", str(tmp_path / "c.dxf")])
     space = ezdxf.readfile(tmp_path / "c.dxf").modelspace()
