@@ -129,7 +129,12 @@ def _to_crs(task: Task, own: pyproj.CRS | None) -> _Way:
         target = target.to_3d()
     feet = next((axis.unit_name for axis in target.axis_info if "foot" in axis.unit_name.lower()), None)
     if feet is not None and not task.feet:
-        raise UsageError(f"--crs {task.crs}: {target.name} is in units of {feet}; give --feet too if that is meant")
+        # heights that stay what they are stay in feet
+        kept = wants is None and has is not None and "foot" not in target.sub_crs_list[0].axis_info[0].unit_name.lower()
+        other = ", or say heights in metres after a +, such as 26918+5703" if kept else ""
+        raise UsageError(
+            f"--crs {task.crs}: {target.name} is in units of {feet}; give --feet too if that is meant{other}"
+        )
     found = datum.operation(own, target, task.epoch, task.grids)
     told = {"operation": found.name, "accuracy_m": found.accuracy_m, "grids": list(found.grids), "epoch": task.epoch}
     return _Way(found.move, target, told)

@@ -86,6 +86,20 @@ def test_an_epoch_moves_coordinates_with_the_plate(tmp_path: Path) -> None:
     assert other[0] == pytest.approx(late[0], abs=2e-3)
 
 
+def test_heights_that_would_stay_in_feet_are_named_with_the_way_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """New York's plane in feet (2263) with heights in feet (6360): 328.0833 ft are 100 m."""
+    place = np.array([[1_312_400.0, 656_200.0, 100.0 * 3937 / 1200]])
+    cloud = written(tmp_path / "a.las", place, "EPSG:2263+6360")
+    assert main(["transform", str(cloud), "--crs", "26918", "-o", str(tmp_path / "b.laz")]) == 2
+    assert "--feet too if that is meant, or say heights in metres after a +" in capsys.readouterr().err
+    assert not (tmp_path / "b.laz").exists()
+    moved, told = done(cloud, "--crs", "26918+5703")
+    assert told["unit"] == "metre"
+    assert moved[0, 2] == pytest.approx(100.0, abs=1e-3)
+
+
 def test_feet_come_only_when_asked_for_and_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = written(tmp_path / "c.laz", np.array([[500_000.0, 4_510_000.0, 10.0]]), "EPSG:6347+5703")
     words = ["transform", str(cloud), "--crs", "6539+6360", "-o", str(tmp_path / "f.laz")]
