@@ -188,6 +188,10 @@ class NodeReader:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process that unpacks."""
         if self._child is None:
             return
         self._child.kill()

@@ -10,11 +10,13 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import unquote, urlsplit
 
 import laspy
 import numpy as np
 import pyproj
 
+from flightlog.errors import CaptureError
 from groundproc.cloud.gpstime import Clock
 from groundproc.cloud.tiling import OVERVIEW, Tile
 
@@ -57,6 +59,44 @@ def write_vpc(
     standard = header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
     items = [_item(tile, overview, crs, schemas, _when(path, tile, standard, header)) for tile in tiles]
     path.write_text(json.dumps({"type": "FeatureCollection", "features": items}, indent=1) + "\n", encoding="utf-8")
+
+
+def read_vpc(path: Path) -> tuple[list[Path], Path | None]:
+    """Files that an index lists, ours or another program's, and their overview where there is one.
+
+    Raises
+    ------
+    CaptureError
+        It is none, or lists what is no file of this machine.
+    """
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+        assets = [feature["assets"] for feature in tree["features"]]
+        data = [
+            next(each["href"] for each in some.values() if "data" in each.get("roles", ["data"])) for some in assets
+        ]
+        overviews = [some["overview"]["href"] for some in assets[:1] if "overview" in some]
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, LookupError, TypeError, AttributeError, StopIteration, RecursionError):
+        raise CaptureError(
+            f"{path}: is no virtual point cloud: expected features with an asset for each file"
+        ) from None
+    if not data:
+        raise CaptureError(f"{path}: lists no files")
+    files = [_beside(path, href) for href in data]
+    return files, _beside(path, overviews[0]) if overviews else None
+
+
+def _beside(path: Path, href: Any) -> Path:
+    """A file by its address in an index."""
+    place = urlsplit(str(href))
+    if place.scheme not in ("", "file"):
+        raise CaptureError(f"{path}: lists {href}, expected files of this machine: fetch them first")
+    found = path.parent / unquote(place.path if place.scheme else str(href))
+    if not found.is_file():
+        raise CaptureError(f"{path}: lists {href}, and there is no such file; expected the tiles beside their index")
+    return found
 
 
 def _item(

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from flightlog.stopflag import StopFlag
+    from groundproc.cloud.reader import Cloud
     from groundproc.viewer.edits import Edit
     from groundproc.viewer.served import Served
     from groundproc.viewer.server import Save
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 HELP = "look at a cloud of any size in the browser, measure in it, and change classes into a copy"
 
 DEFAULT_PORT = 8090
+INDEX = ".vpc"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from groundproc.commands.outputs import add_force
 
     parser.add_argument(
-        "cloud", type=Path, metavar="CLOUD|DIR", help="a COPC, LAZ or LAS file, or a folder of `swath process`"
+        "cloud",
+        type=Path,
+        metavar="CLOUD|DIR",
+        help="a COPC, LAZ or LAS file, tiles by their index (.vpc), or a folder of `swath process` or `swath tile`",
     )
     parser.add_argument(
         "--port", type=int, metavar="PORT", help=f"of the page on this machine; default: {DEFAULT_PORT}, or a free one"
@@ -60,13 +65,18 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--force given, but nothing uses it: without --edited nothing is written")
     cloud, paths = _chosen(arguments.cloud)
     if arguments.edited is not None:
+        if _is_index(cloud):
+            made = "`swath merge` makes one of them, `swath view` of that takes --edited"
+            raise UsageError(
+                f"--edited {arguments.edited}: classes are changed in one file, and {cloud} has tiles; {made}"
+            )
         claim_file(arguments.edited, (".laz", ".las"), arguments.force, [cloud])
     over, at_once = StopFlag(), StopFlag()
 
     def end(number: int, frame: FrameType | None) -> None:
         (at_once if over.is_set() else over).set()
 
-    with _served(cloud, paths) as served:
+    with (_tiled if _is_index(cloud) else _served)(cloud, paths) as served:
         page = _page(ViewServer, served, arguments.port, _saver(cloud, served, arguments.edited, at_once))
         before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -84,18 +94,24 @@ def run(arguments: argparse.Namespace) -> int:
     return 130 if at_once.is_set() else 0
 
 
+def _is_index(path: Path) -> bool:
+    return path.suffix.lower() == INDEX
+
+
 def _chosen(path: Path) -> tuple[Path, list[npt.NDArray[np.float64]]]:
     """The cloud, and the path of the flight where a folder of products is given."""
     from flightlog.errors import UsageError
     from groundproc.commands.inputs import CLOUD, CLOUD_WORDS, expect
 
     if not path.is_dir():
-        expect([path], CLOUD, CLOUD_WORDS)
+        if not (_is_index(path) and path.is_file()):
+            expect([path], CLOUD, CLOUD_WORDS)
         return path, []
-    found = next((path / name for name in ("cloud.copc.laz", "cloud.laz") if (path / name).is_file()), None)
+    names = ("cloud.copc.laz", "cloud.laz", "cloud.vpc", "tiles/cloud.vpc")
+    found = next((path / name for name in names if (path / name).is_file()), None)
     if found is None:
         raise UsageError(
-            f"{path}: holds no cloud.copc.laz or cloud.laz, expected a cloud or a folder of `swath process`"
+            f"{path}: holds no cloud.copc.laz, cloud.laz or cloud.vpc, expected a cloud or a folder of `swath process`"
         )
     return found, _flown(path)
 
@@ -120,16 +136,11 @@ def _served(path: Path, paths: list[npt.NDArray[np.float64]]) -> Iterator[Served
     """The cloud as nodes; one without an index gets a temporary one aside."""
     from tqdm import tqdm
 
-    from flightlog.errors import GeodesyError
     from groundproc.cloud import exports, nodes, reader
-    from groundproc.viewer.scene import units_of
     from groundproc.viewer.served import Served
 
     cloud = reader.look(path)
-    try:
-        units_of(cloud.crs)
-    except GeodesyError as error:
-        raise GeodesyError(f"{path}: {error}") from None
+    _expect_lengths(path, cloud)
     with contextlib.ExitStack() as stack:
         octree = path
         if not nodes.is_copc(path):
@@ -141,7 +152,37 @@ def _served(path: Path, paths: list[npt.NDArray[np.float64]]) -> Iterator[Served
             bar = tqdm(total=cloud.points, unit="points", unit_scale=True, leave=False, disable=not sys.stderr.isatty())
             with bar:
                 exports.write(cloud, octree, octree, bar.update)
-        yield stack.enter_context(Served(octree, path, paths))
+        yield stack.enter_context(Served([octree], path, paths))
+
+
+@contextlib.contextmanager
+def _tiled(path: Path, paths: list[npt.NDArray[np.float64]]) -> Iterator[Served]:
+    """All tiles of an index as nodes."""
+    from flightlog.errors import UsageError
+    from groundproc.cloud import nodes, reader
+    from groundproc.cloud.vpc import read_vpc
+    from groundproc.viewer.served import Served
+
+    tiles, overview = read_vpc(path)
+    if (plain := next((tile for tile in tiles if not nodes.is_copc(tile)), None)) is not None:
+        makes = f"`swath tile {shlex.quote(str(plain))} ... -o DIR` makes such tiles"
+        raise UsageError(f"{plain}: a tile without an index, expected COPC; {makes}")
+    _expect_lengths(tiles[0], reader.look(tiles[0]))
+    if overview is not None and not nodes.is_copc(overview):
+        overview = None
+    with Served(tiles, path, paths, overview) as served:
+        yield served
+
+
+def _expect_lengths(path: Path, cloud: Cloud) -> None:
+    """Refuse angles."""
+    from flightlog.errors import GeodesyError
+    from groundproc.viewer.scene import units_of
+
+    try:
+        units_of(cloud.crs)
+    except GeodesyError as error:
+        raise GeodesyError(f"{path}: {error}") from None
 
 
 def _saver(path: Path, served: Served, output: Path | None, at_once: StopFlag) -> Save | None:

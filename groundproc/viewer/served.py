@@ -1,16 +1,17 @@
 """A cloud that a browser asks for node by node: what it is told first, and the bytes of a node."""
 
-import contextlib
-import queue
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from groundproc.cloud.nodes import Key, NodeReader, octree_of
-from groundproc.cloud.reader import Cloud, look
+from flightlog.errors import CaptureError
+from groundproc.cloud.nodes import Key, octree_of
+from groundproc.cloud.reader import look
+from groundproc.viewer.readers import Readers
 from groundproc.viewer.scene import origin_of, scene
 from groundproc.viewer.shades import TIME, shades_of
 
@@ -18,88 +19,106 @@ Array = npt.NDArray[np.float64]
 
 _SAMPLE: Final = 150_000
 """Points that tell what the attributes span."""
-_READERS: Final = 2
-"""Nodes that are unpacked at the same time."""
+_SAMPLED: Final = 12
+"""Files of many that tell it, where none is an overview."""
 CLASS: Final = "classification"
 _BULK: Final = (5.0, 95.0)
 """Percentiles of each axis between which most points lie."""
 
 
 class Served:
-    """A COPC file for the page.
+    """COPC files for the page, one or the tiles of a large cloud.
 
     Use as a context manager.
 
     Parameters
     ----------
-    path : Path
-        The octree.
+    files : sequence of Path
+        Octrees that share no point.
     of : Path
-        The cloud that it shows, by its own name.
+        The cloud that they show, by its own name.
     paths : sequence of ndarray, shape (k, 3)
         Of a flight, in the cloud's CRS.
+    overview : Path, optional
+        An octree of some of the points of all files, for looking from afar.
 
     Raises
     ------
     CaptureError
-        It cannot be read.
+        One cannot be read, or they lie in several CRSs.
     """
 
-    def __init__(self, path: Path, of: Path, paths: Sequence[Array] = ()) -> None:
-        self.cloud: Cloud = look(path)
-        self._octree = octree_of(path)
-        self._stack = contextlib.ExitStack()
-        self._readers: queue.SimpleQueue[NodeReader] = queue.SimpleQueue()
+    def __init__(
+        self, files: Sequence[Path], of: Path, paths: Sequence[Array] = (), overview: Path | None = None
+    ) -> None:
+        everything = [*files] if overview is None else [*files, overview]
+        self._clouds = [look(path) for path in everything]
+        for cloud in self._clouds:
+            if cloud.crs != self._clouds[0].crs:
+                raise CaptureError(
+                    f"{of}: {cloud.path} lies in {cloud.crs and cloud.crs.name} and {files[0]} in "
+                    f"{self._clouds[0].crs and self._clouds[0].crs.name}, expected one CRS; `swath transform` makes it so"
+                )
+        self._octrees = [octree_of(path) for path in everything]
+        self._readers = Readers(list(zip(self._clouds, self._octrees, strict=True)))
+        self._timed = all(cloud.timed for cloud in self._clouds) and len({each.week_time for each in self._clouds}) == 1
         try:
-            for _ in range(_READERS):
-                self._readers.put(self._stack.enter_context(NodeReader(self.cloud, self._octree)))
-            self._describe(of, paths)
+            self._describe(of, paths, len(files))
         except BaseException:
-            self._stack.close()
+            self._readers.close()
             raise
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._readers.close()
 
-    def _describe(self, of: Path, paths: Sequence[Array]) -> None:
+    def _describe(self, of: Path, paths: Sequence[Array], files: int) -> None:
         """Look at some points, and say what there is."""
-        octree, seen = self._octree, 0
+        overview = files < len(self._octrees)
+        looked = [files] if overview else np.unique(np.linspace(0, files - 1, _SAMPLED).astype(int)).tolist()
         parts = []
-        for key in sorted(octree.nodes):
-            with self._reader() as reader:
-                parts.append(reader.read(octree.nodes[key]))
-            seen += octree.nodes[key].points
-            if seen >= _SAMPLE:
-                break
+        for tree in looked:
+            octree, seen = self._octrees[tree], 0
+            for key in sorted(octree.nodes):
+                with self._readers.of(tree) as reader:
+                    parts.append(reader.read(octree.nodes[key]))
+                seen += octree.nodes[key].points
+                if seen >= _SAMPLE / len(looked):
+                    break
         xyz = np.concatenate([points.xyz_m for points, _ in parts])
-        columns = {name: np.concatenate([points[name] for points, _ in parts]) for name in parts[0][0].columns}
+        common = reduce(set.intersection, (set(cloud.columns) for cloud in self._clouds))
+        columns = {
+            name: np.concatenate([points[name] for points, _ in parts])
+            for name in parts[0][0].columns
+            if name in common
+        }
         time_s = np.concatenate([time for _, time in parts])
         self._begin_s = float(time_s.min())
-        self.shades = shades_of(columns, time_s - self._begin_s if self.cloud.timed else None, keep=(CLASS,))
+        self.shades = shades_of(columns, time_s - self._begin_s if self._timed else None, keep=(CLASS,))
         low, high = xyz.min(axis=0), xyz.max(axis=0)
         # single precision counts from where the points are, not from the middle to one that lies astray
         self.origin_m = origin_of(*np.percentile(xyz, _BULK, axis=0))
-        told = scene(self.origin_m, (low, high), xyz, self.shades, paths, octree.spacing_m, self.cloud.crs)
+        spacing_m = min(octree.spacing_m for octree in self._octrees)
+        told = scene(self.origin_m, (low, high), xyz, self.shades, paths, spacing_m, self._clouds[0].crs)
         self.scene: dict[str, Any] = told | {
             "name": of.name,
-            "total": self.cloud.points,
+            "total": sum(cloud.points for cloud in self._clouds[:files]),
+            "trees": [self._told(tree, tree == files) for tree in range(len(self._octrees))],
+        }
+
+    def _told(self, tree: int, overview: bool) -> dict[str, Any]:
+        octree = self._octrees[tree]
+        return {
             "corner": (np.array(octree.corner_m) - self.origin_m).round(4).tolist(),
             "side": octree.side_m,
+            "spacing": round(octree.spacing_m, 4),
+            "overview": overview,
             "nodes": [[*key, node.points] for key, node in sorted(octree.nodes.items())],
         }
 
-    @contextlib.contextmanager
-    def _reader(self) -> Iterator[NodeReader]:
-        reader = self._readers.get()
-        try:
-            yield reader
-        finally:
-            self._readers.put(reader)
-
-    def node(self, key: Key) -> bytes | None:
+    def node(self, tree: int, key: Key) -> bytes | None:
         """Places from the scene's origin as float32, shape (n, 3), then a byte for each point of each shade; None: no such node.
 
         Raises
@@ -107,11 +126,11 @@ class Served:
         CaptureError
             It is damaged.
         """
-        node = self._octree.nodes.get(key)
+        node = self._octrees[tree].nodes.get(key) if tree < len(self._octrees) else None
         if node is None:
             return None
         names = {shade.name for shade in self.shades}
-        with self._reader() as reader:
+        with self._readers.of(tree) as reader:
             points, time_s = reader.read(node, names)
         parts = [(points.xyz_m - self.origin_m).astype("<f4").tobytes()]
         for shade in self.shades:

@@ -138,12 +138,12 @@ class _Handler(Handler):
 
     def _node(self, name: str) -> None:
         parts = name.split("-")
-        if len(parts) != 4 or not all(part.isdecimal() and len(part) < 11 for part in parts):
+        if len(parts) != 5 or not all(part.isdecimal() and len(part) < 11 for part in parts):
             self.answer(404, "text/plain", b"no such node\n")
             return
-        level, x, y, z = map(int, parts)
+        tree, level, x, y, z = map(int, parts)
         try:
-            found = self.owner.served.node((level, x, y, z))
+            found = self.owner.served.node(tree, (level, x, y, z))
         except SwathError as error:
             self.answer(500, "text/plain; charset=utf-8", f"{error}\n".encode())
             return

@@ -2,21 +2,27 @@
 const scene = JSON.parse(document.getElementById("scene").textContent);
 const SMALLEST = 110, AT_ONCE = 4;  // pixels of a node that is worth its points; requests
 const WIDTH = 2.1;  // of a point, in distances between the points of its level: discs at random close a surface at about twice of them
-const childOf = (node, k) => `${node.level + 1}-${2 * node.x + (k & 1)}-${2 * node.y + (k >> 1 & 1)}-${2 * node.z + (k >> 2)}`;
+const keyOf = (tree, level, x, y, z) => `${tree}-${level}-${x}-${y}-${z}`;
+const childOf = (node, k) => keyOf(node.tree, node.level + 1, 2 * node.x + (k & 1), 2 * node.y + (k >> 1 & 1), 2 * node.z + (k >> 2));
 class Octree {
   constructor(viewer) {
     this.viewer = viewer; this.nodes = new Map(); this.asked = 0; this.lost = 0; this.budget = 2e6; this.waiting = false;
-    for (const [level, x, y, z, count] of scene.nodes) {
-      const side = scene.side / 2 ** level, centre = [x, y, z].map((v, i) => scene.corner[i] + (v + 0.5) * side);
-      this.nodes.set(`${level}-${x}-${y}-${z}`, {level, x, y, z, count, side, centre, chunk: null, state: "away", seen: 0});
-    }
+    this.roots = [];
+    scene.trees.forEach((tree, number) => this.plant(tree, number));
+    this.overview = this.nodes.get(keyOf(scene.trees.findIndex(tree => tree.overview), 0, 0, 0, 0));
+  }
+  plant({corner, side: whole, spacing, nodes}, tree) {
+    const add = (level, x, y, z, count, state) => {
+      const side = whole / 2 ** level, centre = [x, y, z].map((v, i) => corner[i] + (v + 0.5) * side);
+      this.nodes.set(keyOf(tree, level, x, y, z), {tree, level, x, y, z, count, side, centre, spacing: spacing / 2 ** level, chunk: null, state, seen: 0});
+    };
+    for (const node of nodes) add(...node, "away");
     // a parent without points of its own still leads to its children
-    for (const {level, x, y, z} of [...this.nodes.values()]) for (let l = level - 1, k = 1; l >= 0; l--, k++) {
-      const key = `${l}-${x >> k}-${y >> k}-${z >> k}`;
-      if (this.nodes.has(key)) break;
-      const side = scene.side / 2 ** l;
-      this.nodes.set(key, {level: l, x: x >> k, y: y >> k, z: z >> k, count: 0, side, centre: [x >> k, y >> k, z >> k].map((v, i) => scene.corner[i] + (v + 0.5) * side), chunk: null, state: "here", seen: 0});
+    for (const [level, x, y, z] of nodes) for (let l = level - 1, k = 1; l >= 0; l--, k++) {
+      if (this.nodes.has(keyOf(tree, l, x >> k, y >> k, z >> k))) break;
+      add(l, x >> k, y >> k, z >> k, 0, "here");
     }
+    this.roots.push(keyOf(tree, 0, 0, 0, 0));
   }
   // Pixels of a node in the picture; 0 where it is outside.
   pixels(view, node) {
@@ -37,8 +43,10 @@ class Octree {
   choose() {
     const {viewer} = this, view = viewer.view, queue = [], wanted = new Set(), missing = [];
     let points = 0;
-    const offer = key => { const node = this.nodes.get(key); if (!node) return; const size = this.pixels(view, node); if (size > 0 && (node.level === 0 || size > SMALLEST)) queue.push([size, key, node]); };
-    offer("0-0-0-0");
+    // from afar the overview stands for the tiles
+    const alone = node => node.level === 0 && (!this.overview || node === this.overview);
+    const offer = key => { const node = this.nodes.get(key); if (!node) return; const size = this.pixels(view, node); if (size > 0 && (alone(node) || size > SMALLEST)) queue.push([size, key, node]); };
+    for (const root of this.roots) offer(root);
     while (queue.length && points < this.budget) {
       let best = 0;
       for (let i = 1; i < queue.length; i++) if (queue[i][0] > queue[best][0]) best = i;
@@ -57,18 +65,21 @@ class Octree {
       const old = [...this.nodes.values()].filter(node => node.chunk && !node.chunk.shown).sort((a, b) => a.seen - b.seen);
       for (const node of old) { if (loaded <= 1.5 * this.budget) break; viewer.renderer.drop(node.chunk.id); node.chunk = null; node.state = "away"; loaded -= node.count; }
     }
-    if (wanted.has("0-0-0-0")) this.spread(this.nodes.get("0-0-0-0"), wanted);
+    const roots = this.roots.filter(key => wanted.has(key)).map(key => this.nodes.get(key));
+    for (const root of roots) this.spread(root, wanted, root === this.overview ? roots.filter(each => each !== root && each.chunk) : []);
     viewer.dirty = true;
     this.missing = missing; this.shown = shown;
     this.tell();
     while (this.asked < AT_ONCE && this.missing.length) this.load(this.missing.shift());
   }
   // Points are as wide as they are apart, so that surfaces close where no finer nodes are shown: in each eighth as the finest there.
-  spread(node, wanted) {
-    const own = WIDTH * scene.spacing / 2 ** node.level, grains = new Float32Array(8).fill(own);
+  // Where tiles are shown, those of the overview are as narrow as can be.
+  spread(node, wanted, tiles) {
+    const half = node.side / 2, grains = new Float32Array(8);
     for (let k = 0; k < 8; k++) {
-      const key = childOf(node, k), child = this.nodes.get(key);
-      if (wanted.has(key) && child.state === "here") grains[k] = this.spread(child, wanted);
+      const key = childOf(node, k), child = this.nodes.get(key), middle = [k & 1, k >> 1 & 1].map((far, i) => node.centre[i] + (far - 0.5) * half);
+      if (wanted.has(key) && child.state === "here") grains[k] = this.spread(child, wanted, tiles);
+      else grains[k] = tiles.some(({centre, side}) => [0, 1].every(i => Math.abs(centre[i] - middle[i]) < (side + half) / 2)) ? 0 : WIDTH * node.spacing;
     }
     if (node.chunk) node.chunk.grains = grains;
     return Math.min(...grains);
@@ -96,7 +107,7 @@ class Octree {
   get settled() { return !this.waiting && !this.asked && !this.missing.length; }
   tell() {
     const lost = this.lost ? ` ${this.lost.toLocaleString("en")} points cannot be read: ${this.trouble}` : "";
-    this.counts.textContent = `${this.shown.toLocaleString("en")} of ${scene.total.toLocaleString("en")} points shown.${lost}`;
+    this.counts.textContent = `${Math.min(this.shown, scene.total).toLocaleString("en")} of ${scene.total.toLocaleString("en")} points shown.${lost}`;
   }
 }
 // Classes changed by loops; the program behind the page does the same to the whole cloud when it is saved.

@@ -31,7 +31,7 @@ def server(clouds: Clouds, saved: list[list[Edit]]) -> Iterator[ViewServer]:
 
     _, octree = clouds(150_000)
     with Served(
-        octree, Path("<b>cloud.laz"), [np.array([[533_000.0, 6_472_000, 90], [533_050, 6_472_000, 90]])]
+        [octree], Path("<b>cloud.laz"), [np.array([[533_000.0, 6_472_000, 90], [533_050, 6_472_000, 90]])]
     ) as served:
         server = ViewServer(served, 0, save)
         yield server
@@ -56,8 +56,8 @@ def test_all_nodes_together_are_the_cloud(server: ViewServer, clouds: Clouds) ->
     scene = server.served.scene
     shades = {shade["name"]: k for k, shade in enumerate(scene["shades"])}
     places, classes = [], []
-    for *key, count in scene["nodes"]:
-        status, body = ask(server, "/node?key=" + "-".join(map(str, key)))
+    for *key, count in scene["trees"][0]["nodes"]:
+        status, body = ask(server, "/node?key=0-" + "-".join(map(str, key)))
         assert status == 200
         assert len(body) == count * (12 + len(shades))
         places.append(np.frombuffer(body, "<f4", 3 * count).reshape(-1, 3))
@@ -90,10 +90,11 @@ def test_the_page_lets_nothing_in_but_what_its_own_server_says(server: ViewServe
     "path",
     [
         "/node",
-        "/node?key=0-0-0",
-        "/node?key=9-0-0-0",
-        "/node?key=0-0-0-x",
-        "/node?key=99999999999-0-0-0",
+        "/node?key=0-0-0-0",
+        "/node?key=0-9-0-0-0",
+        "/node?key=0-0-0-0-x",
+        "/node?key=0-99999999999-0-0-0",
+        "/node?key=1-0-0-0-0",
         "/../x",
         "/edits",
     ],
