@@ -1,6 +1,7 @@
 """`swath plan`: lines over an area, the density that they give, and a mission to load into the ground station."""
 
 import argparse
+import sys
 from pathlib import Path
 
 HELP = "plan a flight: lines over an area for a density or an overlap, as a mission file and a picture"
@@ -75,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     made = plan(wish)
     write_mission(arguments.output, *made.places_deg(), arguments.height, arguments.speed)
-    draw(picture, made.area, made.route, made.swath, made.spacing_m)
+    draw(picture, made.area, made.route, made.coverage)
     told = made.figures()
     if arguments.json is not None:
         write_json(arguments.json, told)
@@ -83,10 +84,17 @@ def run(arguments: argparse.Namespace) -> int:
     batteries = (
         "" if arguments.battery is None else f", {made.batteries} {'battery' if made.batteries == 1 else 'batteries'}"
     )
+    overlap = f"overlap {told['overlap']:.0%}" if told["overlap"] >= 0.005 else "no overlap"
     print(
         f"{told['lines']} lines {told['spacing_m']:.1f} m apart, {told['length_m'] / 1000.0:.2f} km, "
         f"{told['seconds'] / 60.0:.1f} min{batteries}\n"
-        f"{density['least']:.0f} to {density['most']:.0f} points a square metre (mean {density['mean']:.0f}) on level ground, "
-        f"overlap {told['overlap']:.0%}\n{arguments.output}: written; look at {picture}"
+        f"{density['mean']:.0f} points a square metre in the mean, at least {density['tenth']:.0f} on nine tenths of the area and "
+        f"{density['least']:.0f} everywhere, on level ground; {overlap}\n{arguments.output}: written; look at {picture}"
     )
+    if told["gaps"] > 0.0:
+        print(
+            f"swath: warning: {told['gaps']:.1%} of the area gets less than one point a square metre; set lines closer (--spacing), "
+            "or begin them farther out (--margin)",
+            file=sys.stderr,
+        )
     return 0

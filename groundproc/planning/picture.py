@@ -7,11 +7,11 @@ import numpy as np
 import shapely
 
 from groundproc.files import written_aside
-from groundproc.planning.coverage import Swath
+from groundproc.planning.coverage import Coverage
 from groundproc.planning.route import Route
 
 
-def draw(path: Path, area: Any, route: Route, swath: Swath, spacing_m: float) -> None:
+def draw(path: Path, area: Any, route: Route, coverage: Coverage) -> None:
     """Draw it.
 
     Raises
@@ -35,17 +35,17 @@ def draw(path: Path, area: Any, route: Route, swath: Swath, spacing_m: float) ->
     plan.set_xlabel(f"easting - {corner[0]:.0f} [m]")
     plan.set_ylabel(f"northing - {corner[1]:.0f} [m]")
     plan.set_title(f"{route.lines} lines, {route.length_m / 1000:.2f} km, {route.seconds / 60:.1f} min")
-    across.plot(swath.across_m, swath.density, color="#888888", label="one line")
-    lines = swath.of_lines(spacing_m)
-    across.plot(
-        np.linspace(-0.5, 0.5, len(lines)) * spacing_m,
-        np.roll(lines, len(lines) // 2),
-        color="#1f5fa8",
-        label="all lines",
-    )
-    across.set_xlim(-2.0 * spacing_m, 2.0 * spacing_m)
+    reach = 0.6 * float(np.hypot(*np.ptp(edge, axis=0)))
+    away = np.linspace(-reach, reach, 600)
+    angle = np.deg2rad(route.heading_deg)
+    centre = np.array([area.centroid.x, area.centroid.y])
+    cut = centre + away[:, None] * np.array([np.cos(angle), -np.sin(angle)])
+    found = coverage.density(cut, route.places_m)
+    across.plot(away, found, color="#888888", label="through the middle, across the lines")
+    inside = np.where(shapely.contains_xy(area, *cut.T), found, np.nan)
+    across.plot(away, inside, color="#1f5fa8", label="of it in the area")
     across.set_ylim(0.0, None)
-    across.set_xlabel("across the line [m]")
+    across.set_xlabel("from the middle [m]")
     across.set_ylabel("points a square metre")
     across.legend()
     with written_aside(path) as aside:

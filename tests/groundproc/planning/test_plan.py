@@ -1,21 +1,32 @@
 """A plan: density by counting, lines that cover, a mission that pymavlink reads."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import shapely
 from pymavlink import mavwp
+from scipy.spatial.transform import Rotation
 
 from flightlog.errors import UsageError
 from flightlog.frames import mat_local_ins
+from flightlog.hdl32e import BLOCKS, FIRING_NS
 from flightlog.mount import Mount
 from groundproc import sensors
 from groundproc.cli import main
-from groundproc.planning.coverage import spacing_for, swath
+from groundproc.planning.coverage import Coverage
+from groundproc.planning.plan import Wish, plan
 from groundproc.planning.route import route
 from groundproc.sensors.shots import Gate
+from simulator.clocks import clocks
+from simulator.config import Options
+from simulator.flight import Flight
+from simulator.lidar import Lidar
+from simulator.route import Route as SimulatedRoute
+from simulator.scene import scene
 
 GATE = Gate(255.0, 105.0, 0.0, 70.0)
 AREA = {
@@ -64,20 +75,120 @@ def test_density_is_what_shots_of_a_flight_count_to() -> None:
         # every point of so many seconds lies on so many metres of strip, wherever ahead it is
         counts += np.histogram((east * reach)[met], np.arange(-20.0, 21.0, 5.0))[0]
     found = counts / (5.0 * speed * seconds)
-    told = swath(lidar, mount, GATE, height, speed)
+    told = Coverage(lidar, mount, GATE, height, speed, 0.0).swath
     expected = [
         told.density[(told.across_m > low) & (told.across_m < low + 5.0)].mean() for low in np.arange(-20.0, 20.0, 5.0)
     ]
     np.testing.assert_allclose(found, expected, rtol=0.01)
 
 
-def test_the_widest_spacing_that_is_dense_enough_is_taken() -> None:
-    strip = swath(sensors.lidar("HDL-32E"), Mount(), GATE, 30.0, 5.0)
-    spacing = spacing_for(strip, 100.0)
-    assert strip.of_lines(spacing).min() >= 100.0
-    assert strip.of_lines(spacing + 0.5).min() < 100.0
-    # all points of a line fall somewhere between the lines
-    np.testing.assert_allclose(strip.of_lines(spacing).mean() * spacing, strip.density.sum() * 0.25, rtol=1e-3)
+def test_the_widest_spacing_that_is_dense_enough_is_taken(area: Path) -> None:
+    """To the step of 2 % in which it is looked for."""
+    made = plan(Wish(area, 30.0, 5.0, density=100.0))
+    assert made.figures()["density"]["least"] >= 100.0
+    wider = plan(Wish(area, 30.0, 5.0, spacing_m=made.spacing_m / 0.98 + 1e-9))
+    assert wider.figures()["density"]["least"] < 100.0
+
+
+def test_all_points_of_a_leg_fall_somewhere() -> None:
+    """The sum over the ground is the rate of what is met times the time: nothing is gained or lost at the ends."""
+    coverage = Coverage(sensors.lidar("HDL-32E"), Mount(), GATE, 30.0, 5.0, np.deg2rad(-7.5))
+    turns = np.array([[3.0, -4.0], [83.0, 56.0]])
+    east, north = np.meshgrid(np.arange(-100.0, 190.0), np.arange(-100.0, 160.0))
+    found = coverage.density(np.column_stack([east.ravel(), north.ravel()]), turns)
+    # cells of half a metre looked at every metre, aslant: a hundredth
+    np.testing.assert_allclose(found.sum(), coverage.straight.rate * 100.0 / 5.0, rtol=0.01)
+
+
+@pytest.mark.parametrize(("yaw_deg", "level_pitch_deg"), [(0.0, -32.0), (180.0, -8.0)])
+def test_the_lean_of_the_aircraft_turns_the_mount_as_a_whole(yaw_deg: float, level_pitch_deg: float) -> None:
+    """Nose down by 12 deg, a lidar that looks 20 deg down ahead looks 32 deg down, and one that looks back 8 deg."""
+    lidar, mount = sensors.lidar("HDL-32E"), Mount().with_lidar(yaw_deg=yaw_deg)
+    leaning = Coverage(lidar, mount, GATE, 20.0, 8.0, np.deg2rad(-12.0)).straight
+    level = Coverage(lidar, mount.with_lidar(pitch_deg=level_pitch_deg), GATE, 20.0, 8.0, 0.0).straight
+    assert leaning.rate == pytest.approx(level.rate, rel=1e-3)  # shots at the very end of the range gate
+    np.testing.assert_allclose(leaning.before[:, -1], level.before[:, -1], rtol=0, atol=0.02 * level.before.max())
+
+
+def test_a_lidar_that_looks_to_the_side_is_tipped_about_its_own_axis_by_the_lean() -> None:
+    """scipy's rotations as the witness, shot by shot: yaw 90 deg, 20 deg down, nose down by 12 deg."""
+    lidar, mount = sensors.lidar("HDL-32E"), Mount().with_lidar(yaw_deg=90.0)
+    both = Rotation.from_euler("X", -12.0, degrees=True) * Rotation.from_euler("ZX", [90.0, -20.0], degrees=True)
+    azimuth = np.deg2rad(np.arange(-104.95, 105.0, 0.1))
+    counts = np.zeros(12)
+    for elevation in lidar.lasers.elevation_rad:
+        flat = np.cos(elevation)
+        beam = np.column_stack(
+            [flat * np.sin(azimuth), flat * np.cos(azimuth), np.full(len(azimuth), np.sin(elevation))]
+        )
+        right, _, up = both.apply(beam).T
+        reach = np.where(up < 0.0, -20.0 / np.where(up < 0.0, up, -1.0), np.inf)
+        counts += np.histogram((right * reach)[reach <= 70.0], np.arange(-60.0, 61.0, 10.0))[0]
+    told = Coverage(lidar, mount, GATE, 20.0, 8.0, np.deg2rad(-12.0)).swath
+    found = [
+        told.density[(told.across_m > low) & (told.across_m < low + 10.0)].mean()
+        for low in np.arange(-60.0, 60.0, 10.0)
+    ]
+    expected = counts / 3600.0 / 46.08e-6 / (10.0 * 8.0)
+    np.testing.assert_allclose(found, expected, rtol=0.01, atol=1.0)
+
+
+FLOWN = [
+    # width and depth of the area [m], spacing, height, mount; what plan over flight was: mean, tenth
+    pytest.param(60.0, 30.0, 20.0, 20.0, Mount(), id="small"),  # 1.03, 0.98
+    pytest.param(60.0, 30.0, 20.0, 20.0, Mount().with_lidar(yaw_deg=90.0), id="small, to the left"),  # 1.00, 0.94
+    pytest.param(160.0, 100.0, 40.0, 30.0, Mount(), id="larger"),  # 1.04, 1.02
+    pytest.param(160.0, 100.0, 40.0, 30.0, Mount().with_lidar(pitch_deg=-90.0), id="larger, across"),  # 1.01, 1.01
+]
+
+
+@pytest.mark.parametrize(("width", "depth", "spacing", "height", "mount"), FLOWN)
+def test_the_density_is_that_of_a_simulated_flight_along_the_lines(
+    width: float, depth: float, spacing: float, height: float, mount: Mount
+) -> None:
+    """Over the area's mean and for its poorest tenth within 10 %: 8 m/s, gusts, turns, grass that is lost where it is far and aslant."""
+    area, speed = shapely.box(-250.0, -350.0, -250.0 + width, -350.0 + depth), 8.0
+    turns = route(area, spacing, speed, None, 10.0, calibrate=False).places_m
+    points = _flown(turns, height, speed, mount)
+    edges = np.arange(-250.0, -249.9 + width, 2.5), np.arange(-350.0, -349.9 + depth, 2.5)
+    found = np.histogram2d(*points.T, edges)[0] * _EVERY / 2.5**2
+    middles = [0.5 * (each[1:] + each[:-1]) for each in edges]
+    places = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+    coverage = Coverage(sensors.lidar("HDL-32E"), mount, GATE, height, speed, np.deg2rad(-12.0))
+    told = coverage.density(places, turns)
+    assert told.mean() == pytest.approx(found.mean(), rel=0.10)
+    assert np.percentile(told, 10.0) == pytest.approx(np.percentile(found, 10.0), rel=0.10)
+
+
+_EVERY = 4
+"""Of the flight's pieces of 0.1 s one in so many is rendered: 3 m of way, which is little beside the swath."""
+
+
+def _flown(
+    turns_m: npt.NDArray[np.float64], height_m: float, speed_m_s: float, mount: Mount
+) -> npt.NDArray[np.float64]:
+    """East and north of what the simulated lidar sees within the gate."""
+    options = Options()
+    # a line instead of a cone: a seventh of the rays, and as many echoes of level ground
+    beams = dataclasses.replace(options.lidar, footprint_mrad=0.0)
+    points_m = tuple((east, north, height_m) for east, north in turns_m.tolist())
+    seconds = float(np.linalg.norm(np.diff(turns_m, axis=0), axis=1).sum()) / speed_m_s
+    flight = Flight(
+        SimulatedRoute(points_m, speed_m_s=speed_m_s, loop_from=-1, hold_s=0.0, smooth_s=0.7),
+        seconds,
+        options.flight,
+        1,
+    )
+    clock = clocks(options.clocks).lidar
+    lidar = Lidar(scene("field", 1).world, flight, mount, clock, beams, 1)
+    points, pieces = [], 181
+    for first in range(0, lidar.packets_until(seconds) - pieces, pieces * _EVERY):
+        sweep = lidar.sweep(first, pieces)
+        firing = (sweep.truth["lidar_ns"] - clock.start_ns) // FIRING_NS - first * BLOCKS
+        azimuth = sweep.packets["blocks"]["azimuth"].ravel()[firing] * 0.01
+        kept = (np.abs((azimuth + 180.0) % 360.0 - 180.0) <= 105.0) & (sweep.truth["range_m"] <= 70.0)
+        points.append(np.column_stack([sweep.truth["x"], sweep.truth["y"]])[kept])
+    return np.concatenate(points)
 
 
 @pytest.mark.parametrize("spacing_m", [20.0, 124.0])
@@ -138,6 +249,21 @@ def test_a_mission_is_read_by_pymavlink_and_lies_where_the_area_is(
     assert figures["density"]["least"] >= 100.0
     assert figures["batteries"] == int(np.ceil(figures["seconds"] / 600.0))
     assert (tmp_path / "plan.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("spacing", "overlap", "gaps"), [("60", "overlap 4", False), ("250", "no overlap", True)])
+def test_lines_that_do_not_overlap_are_said_in_words_and_gaps_are_a_warning(
+    area: Path, tmp_path: Path, spacing: str, overlap: str, gaps: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, told = tmp_path / "p.waypoints", tmp_path / "p.json"
+    words = ["--height", "30", "--speed", "5", "--spacing", spacing, "-o", str(out), "--json", str(told)]
+    assert main(["plan", str(area), *words]) == 0
+    said = capsys.readouterr()
+    assert overlap in said.out
+    assert ("% of the area gets less than one point a square metre" in said.err) == gaps
+    figures = json.loads(told.read_text())
+    assert figures["overlap"] >= 0.0
+    assert (figures["gaps"] > 0.0) == gaps
 
 
 @pytest.mark.parametrize(
