@@ -12,7 +12,8 @@ peak_gb_60min               highest resident memory of the longest flight
 time_per_minute_spread      by how much CPU time for a minute of flight differs between the shortest and the longest flight
 report_seconds              until a million points of a report are seen: see report.py
 
-The longest flight is the simulated one repeated. An hour (`--minutes 5 60`) takes an hour and 40 GB of disk; the default is shorter. Each
+The long flights are over a town, with beams as lines so that their rendering ends. An hour (`--minutes 5 60`) takes half an hour to render,
+more than an hour to process, and 60 GB of disk; the default is shorter. `--long LOG ...` takes flights that are there. Each
 FIGURE is measured by itself where it is named: on a busy machine those of CPU time and memory (copc, grid, peak, spread) still hold, those
 by the clock (real_time, laz, workers, report) do not. `workers --seconds 10` is short. Lines that begin with `note:` say what the figures
 are of; docs/benchmarks.md keeps them.
@@ -29,7 +30,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import laspy
 import numpy as np
@@ -45,13 +46,16 @@ from groundproc.raster.cells import STATISTICS, Cells
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 FLIGHT: Final = "survey_fast_gyro"
+LONG_FLIGHT: Final = "long"
+LONG_OPTIONS: Final = "lidar: {footprint_mrad: 0}\n"
+"""Beams without width: several times quicker to render, and as many points."""
 CELL_M: Final = 0.25
 PIECE: Final = 200_000
 """Points handed on at once, as they are placed."""
 LIMIT_AT_GOAL: Final = 24.0
 """Real time factor of two threads of lazrs on the machine that the goals are for."""
 GOOD: Final = (0, 3)
-"""Exit codes of a flight whose products are there; a repeated one jumps at its seams, and is doubtful."""
+"""Exit codes of a flight whose products are there, good or doubtful."""
 Figures = dict[str, float | None]
 
 
@@ -67,13 +71,18 @@ class Bench:
         Of flight in it.
     minutes : list of float
         Lengths of the flights that memory and time are compared for.
+    long_logs : list of Path
+        Such flights where they are there already; else they are rendered.
     rounds : int
     """
 
-    def __init__(self, folder: Path, log: Path, seconds: float, minutes: list[float], rounds: int) -> None:
-        self.folder, self.log, self.seconds, self.minutes, self.rounds = folder, log, seconds, minutes, rounds
+    def __init__(
+        self, folder: Path, log: Path, seconds: float, minutes: list[float], long_logs: list[Path], rounds: int
+    ) -> None:
+        self.folder, self.log, self.seconds, self.rounds = folder, log, seconds, rounds
         self._records: tuple[laspy.LasHeader, npt.NDArray[np.void], list[Points]] | None = None
-        self._long: dict[int, tuple[float, float, float]] = {}
+        self._sources: list[float | Path] = [*long_logs] or [*minutes]
+        self._long: list[Long] = []
 
     def cloud(self) -> tuple[laspy.LasHeader, npt.NDArray[np.void], list[Points]]:
         """Header, records and points of the flight's cloud, with all attributes."""
@@ -89,20 +98,58 @@ class Bench:
             self._records = header, records, [each for piece in pieces for each in cut(piece)]
         return self._records
 
-    def long(self, minutes: float) -> tuple[float, float, float]:
-        """The flight repeated to about so many minutes and processed: minutes, CPU time [s] a minute, highest resident memory [GB]."""
-        times = max(round(60.0 * minutes / self.seconds), 1)
-        if times not in self._long:
-            log, out = self.folder / "long.mcap", self.folder / "long"
-            words = [sys.executable, ROOT / "benchmarks" / "long_log.py", self.log, log, "--times", str(times)]
-            subprocess.run(words, check=True)
-            wall_s, cpu_s, peak_gb = process(log, out)
-            shutil.rmtree(out)
-            log.unlink()
-            flown = times * self.seconds / 60.0
-            self._long[times] = flown, cpu_s / flown, peak_gb
-            print(f"{flown:.1f} min: {wall_s:.0f} s, {cpu_s:.0f} CPU-s, {peak_gb:.2f} GB", flush=True)
-        return self._long[times]
+    def long(self) -> list["Long"]:
+        """The long flights, processed, the shortest first."""
+        if not self._long:
+            self._long = sorted(self._processed(each) for each in self._sources)
+        return self._long
+
+    def _processed(self, source: float | Path) -> "Long":
+        """A flight of so many minutes, or that of a log."""
+        log, out = self.folder / "rendered" / "flight.mcap", self.folder / "long"
+        if isinstance(source, Path):
+            log = source
+        else:
+            simulate(LONG_FLIGHT, 60.0 * source, log.parent, LONG_OPTIONS)
+        wall_s, cpu_s, peak_gb = process(log, out)
+        quality = json.loads((out / "quality.json").read_text())
+        minutes = quality["trajectory"]["covered_s"] / 60.0
+        shutil.rmtree(out)
+        if log is not source:
+            shutil.rmtree(log.parent)
+        found = Long(minutes, cpu_s / minutes, peak_gb, minutes * 60.0 / wall_s, quality["points"]["written"] / 1e6)
+        print(found.told, flush=True)
+        return found
+
+
+class Long(NamedTuple):
+    """What a long flight took: minutes, CPU time [s] a minute, highest resident memory [GB], times real time, million points."""
+
+    minutes: float
+    cpu_s_a_minute: float
+    peak_gb: float
+    real_time: float
+    mpoints: float
+
+    @property
+    def told(self) -> str:
+        """In words."""
+        return (
+            f"{self.minutes:.1f} min, {self.mpoints:.0f} M points: {self.cpu_s_a_minute:.1f} CPU-s a minute, "
+            f"{self.peak_gb:.2f} GB, {self.real_time:.2f} x real time"
+        )
+
+
+def simulate(flight: str, seconds: float, folder: Path, options: str = "") -> None:
+    """Render a named flight into a folder."""
+    folder.mkdir()
+    words = ["simulate", "--flight", flight, "--duration", str(seconds), "--seed", "11", "-o", folder]
+    if options:
+        file = folder / "options.yaml"
+        file.write_text(options)
+        words += ["--config", file]
+    program = "import sys; from groundproc.cli import main; sys.exit(main())"
+    subprocess.run([sys.executable, "-c", program, *words], check=True, stdout=subprocess.DEVNULL, env=as_installed())
 
 
 def cut(points: Points) -> list[Points]:
@@ -292,17 +339,15 @@ class Cluster:
 
 def peak(bench: Bench) -> Figures:
     """Memory of the longest flight: other programs do not change it."""
-    minutes, cpu_s, peak_gb = bench.long(max(bench.minutes))
-    note(f"peak_gb_60min is of {minutes:.1f} min, at {cpu_s:.1f} CPU-s a minute")
-    return {"peak_gb_60min": peak_gb}
+    longest = bench.long()[-1]
+    note(f"peak_gb_60min is of {longest.told}")
+    return {"peak_gb_60min": longest.peak_gb}
 
 
 def spread(bench: Bench) -> Figures:
     """CPU time for a minute of flights of several lengths."""
-    runs = [bench.long(minutes) for minutes in bench.minutes]
-    told = "; ".join(f"{minutes:.1f} min: {cpu_s:.1f} CPU-s a minute, {gb:.2f} GB" for minutes, cpu_s, gb in runs)
-    note(f"time_per_minute_spread of {told}")
-    costs = [cpu_s for _, cpu_s, _ in runs]
+    note(f"time_per_minute_spread of {'; '.join(each.told for each in bench.long())}")
+    costs = [each.cpu_s_a_minute for each in bench.long()]
     return {"time_per_minute_spread": max(costs) / min(costs) - 1.0}
 
 
@@ -344,6 +389,7 @@ def main() -> int:
     parser.add_argument(
         "--minutes", type=float, nargs="+", default=[1.0, 4.0], metavar="MIN", help="lengths to compare, default 1 4"
     )
+    parser.add_argument("--long", type=Path, nargs="+", default=[], metavar="MCAP", help="flights to compare instead")
     parser.add_argument("--rounds", type=int, default=3, metavar="N", help="of what is compared, default 3")
     asked = parser.parse_args()
     if unknown := set(asked.figures) - set(FIGURES):
@@ -352,10 +398,9 @@ def main() -> int:
         folder, log = Path(name), asked.log
         if log is None:
             log = folder / "flight" / "flight.mcap"
-            program = "import sys; from groundproc.cli import main; sys.exit(main())"
-            words = ["simulate", "--flight", FLIGHT, "--duration", str(asked.seconds), "--seed", "11", "-o", log.parent]
-            subprocess.run([sys.executable, "-c", program, *words], check=True, stdout=subprocess.DEVNULL)
-        bench, found = Bench(folder, log, asked.seconds, asked.minutes, asked.rounds), Figures()
+            simulate(FLIGHT, asked.seconds, log.parent)
+        bench = Bench(folder, log, asked.seconds, asked.minutes, asked.long, asked.rounds)
+        found = Figures()
         for each in asked.figures or FIGURES:
             found |= FIGURES[each](bench)
             print(f"{each}: {found}", file=sys.stderr, flush=True)
