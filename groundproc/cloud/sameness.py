@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import pyproj
 
 from flightlog.errors import CaptureError, GeodesyError
-from groundproc.cloud.reader import Cloud
+from groundproc.cloud.reader import Cloud, chunks
 
 
 def agreed_crs(clouds: Sequence[Cloud]) -> pyproj.CRS | None:
@@ -65,6 +66,9 @@ def agreed_times(clouds: Sequence[Cloud]) -> None:
     CaptureError
     """
     timed = [cloud for cloud in clouds if cloud.timed]
+    if len({cloud.week_time for cloud in timed}) > 1:
+        # times that are 0 count from nowhere: programs that know none write them so, and leave the header's bit unset
+        timed = [cloud for cloud in timed if not cloud.week_time or _any_time(cloud)]
     for other in timed[1:]:
         if other.week_time != timed[0].week_time:
             weekly, standard = (other, timed[0]) if other.week_time else (timed[0], other)
@@ -72,6 +76,12 @@ def agreed_times(clouds: Sequence[Cloud]) -> None:
                 f"{weekly.path}: its times are seconds of the GPS week, those of {standard.path} adjusted standard GPS time; expected one "
                 "of both"
             )
+
+
+def _any_time(cloud: Cloud) -> bool:
+    """Whether the first points of a file have times."""
+    first = next(chunks(cloud, columns=()), None)
+    return first is not None and bool(np.any(first.record.gps_time))
 
 
 def horizontal(crs: pyproj.CRS | None) -> pyproj.CRS | None:

@@ -113,6 +113,18 @@ def test_what_does_not_go_together_is_one_sentence_and_leaves_nothing(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.laz", "b.laz"]
 
 
+@pytest.mark.parametrize("names", [("a.laz", "b.laz"), ("b.laz", "a.laz")])
+def test_a_cloud_whose_times_are_all_zero_goes_with_any(tmp_path: Path, names: tuple[str, str]) -> None:
+    timed = cloud(tmp_path / "a.laz", 1, count=100)
+    dark = cloud(tmp_path / "b.laz", 2, count=100, weekly=True)
+    dark.gps_time = np.zeros(100)
+    dark.write(tmp_path / "b.laz")
+    found = merged(tmp_path, *(str(tmp_path / name) for name in names))
+    assert found.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    times = {"a.laz": np.asarray(timed.gps_time), "b.laz": np.zeros(100)}
+    np.testing.assert_array_equal(found.gps_time, np.concatenate([times[name] for name in names]))
+
+
 def test_one_cloud_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cloud(tmp_path / "a.laz", 1, count=100)
     assert main(["merge", str(tmp_path / "a.laz"), str(tmp_path / "a.laz"), "-o", str(tmp_path / "o.laz")]) == 2
