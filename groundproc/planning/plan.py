@@ -1,5 +1,6 @@
 """A flight planned: from area, height and speed to lines, density and battery."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ from flightlog.mount import Mount
 from groundproc import sensors
 from groundproc.geodesy import projected_crs
 from groundproc.planning.coverage import Coverage
-from groundproc.planning.route import Route, route
+from groundproc.planning.route import Route, evened, route
 from groundproc.sensors.shots import Gate
 from groundproc.vectors.features import read_features
 
@@ -143,10 +144,13 @@ def plan(wish: Wish) -> Plan:
         sensors.lidar("HDL-32E"), wish.mount, wish.gate, wish.height_m, wish.speed_m_s, np.deg2rad(wish.leaning_deg())
     )
     inside, edge = _places(area), _edge(area)
-    if wish.density is None:
-        spacing = wish.spacing_m or coverage.swath.width_m() * (1.0 - (0.5 if wish.overlap is None else wish.overlap))
-    else:
+    if wish.spacing_m is not None:
+        spacing = wish.spacing_m
+    elif wish.density is not None:
         spacing = _dense(area, np.concatenate([edge, inside]), coverage, wish, wish.density)
+    else:
+        overlap = 0.5 if wish.overlap is None else wish.overlap
+        spacing = evened(area, coverage.swath.width_m() * (1.0 - overlap), wish.heading_deg)
     flown = _route(area, spacing, wish)
     batteries = 1 if wish.battery_s is None else flown.batteries(wish.battery_s)
     density, edge_density = (coverage.density(places, flown.places_m) for places in (inside, edge))
@@ -158,7 +162,7 @@ def _route(area: Any, spacing_m: float, wish: Wish) -> Route:
 
 
 def _dense(area: Any, places_m: Array, coverage: Coverage, wish: Wish, density: float) -> float:
-    """The widest spacing of lines, to 2 %, that leaves no place of the area with fewer points than asked for.
+    """The spacing of as few lines as leave no place of the area with fewer points than asked for, looked for in steps of 2 %.
 
     Raises
     ------
@@ -166,8 +170,12 @@ def _dense(area: Any, places_m: Array, coverage: Coverage, wish: Wish, density: 
         Not even lines side by side are enough.
     """
 
-    def least(spacing_m: float) -> float:
+    @functools.cache
+    def of_lines(spacing_m: float) -> float:
         return float(coverage.density(places_m, _route(area, spacing_m, wish).places_m).min())
+
+    def least(spacing_m: float) -> float:
+        return of_lines(evened(area, spacing_m, wish.heading_deg))
 
     # of wider lines even the mean would be less; and strips side by side, lest the ways between lines make up for missing lines
     widest = min(coverage.straight.rate / wish.speed_m_s / density, coverage.swath.width_m())
@@ -182,8 +190,9 @@ def _dense(area: Any, places_m: Array, coverage: Coverage, wish: Wish, density: 
     finer = min(most, spacing / _FIRST)
     while (finer := finer * _NEXT) > spacing:
         if least(finer) >= density:
-            return finer
-    return spacing
+            spacing = finer
+            break
+    return evened(area, spacing, wish.heading_deg)
 
 
 def _places(area: Any) -> Array:

@@ -111,6 +111,23 @@ def route(
     return Route(path, heading, len(lines), length, seconds, speed_m_s)
 
 
+def evened(area: Any, spacing_m: float, heading_deg: float | None) -> float:
+    """The spacing of as many lines as an area needs with a spacing, the outer ones on its edges: no wider than that.
+
+    Lines beyond the edges would leave there what nobody asked for.
+    """
+    across = _across(area, _along(area) if heading_deg is None else heading_deg)
+    spaces = max(int(np.ceil(across / spacing_m)), 1)
+    # by rounding, one line more would be laid
+    return min(spacing_m, across / spaces * (1.0 + 1e-9))
+
+
+def _across(area: Any, heading_deg: float) -> float:
+    """Width of an area across lines of a heading."""
+    angle = np.deg2rad(heading_deg)
+    return float(np.ptp(shapely.get_coordinates(area) @ np.array([np.cos(angle), -np.sin(angle)])))
+
+
 def _along(area: Any) -> float:
     """Heading of the longer side of the smallest rectangle about an area."""
     corners = np.array(area.minimum_rotated_rectangle.exterior.coords)[:3]

@@ -82,12 +82,32 @@ def test_density_is_what_shots_of_a_flight_count_to() -> None:
     np.testing.assert_allclose(found, expected, rtol=0.01)
 
 
-def test_the_widest_spacing_that_is_dense_enough_is_taken(area: Path) -> None:
-    """To the step of 2 % in which it is looked for."""
-    made = plan(Wish(area, 30.0, 5.0, density=100.0))
-    assert made.figures()["density"]["least"] >= 100.0
-    wider = plan(Wish(area, 30.0, 5.0, spacing_m=made.spacing_m / 0.98 + 1e-9))
-    assert wider.figures()["density"]["least"] < 100.0
+def test_as_few_lines_are_flown_as_are_dense_enough_and_none_beyond_the_area(area: Path) -> None:
+    asked = 500.0
+    made = plan(Wish(area, 30.0, 5.0, density=asked))
+    assert made.figures()["density"]["least"] >= asked
+    width = (made.route.lines - 1) * made.spacing_m
+    side = np.array([np.cos(np.deg2rad(made.route.heading_deg)), -np.sin(np.deg2rad(made.route.heading_deg))])
+    np.testing.assert_allclose(width, np.ptp(shapely.get_coordinates(made.area) @ side), rtol=1e-6)
+    # as many lines farther apart end beyond the area: a longer way for less in the mean
+    wider = plan(Wish(area, 30.0, 5.0, spacing_m=width / (made.route.lines - 1.5)))
+    assert wider.route.lines == made.route.lines
+    assert wider.route.length_m > made.route.length_m
+    assert wider.figures()["density"]["mean"] < made.figures()["density"]["mean"]
+    # one line less is not enough
+    fewer = plan(Wish(area, 30.0, 5.0, spacing_m=width / (made.route.lines - 2) + 1e-6))
+    assert fewer.route.lines == made.route.lines - 1
+    assert fewer.figures()["density"]["least"] < asked
+
+
+@pytest.mark.parametrize("overlap", [0.1, 0.5, 0.8])
+def test_strips_overlap_as_asked_for_or_more_without_a_line_more(area: Path, overlap: float) -> None:
+    made = plan(Wish(area, 30.0, 5.0, overlap=overlap))
+    told = made.figures()
+    assert told["overlap"] >= overlap - 1e-9
+    loose = plan(Wish(area, 30.0, 5.0, spacing_m=told["width_m"] * (1.0 - overlap)))
+    assert loose.route.lines == made.route.lines
+    assert made.route.length_m <= loose.route.length_m + 1e-6
 
 
 def test_all_points_of_a_leg_fall_somewhere() -> None:
