@@ -38,7 +38,7 @@ def flown(simulated: Callable[..., "Simulated"], seed: int) -> "Simulated":
     flight = plan("meadow" if name == "wood" else name)
     scene = "wood" if name == "wood" else flight.scene
     options = as_stated(flight.options, seed)
-    spread = Survey().boresight_sigma_deg * np.sqrt(3.0)  # uniform, of that sigma
+    spread = float(Survey().boresight_sigma_deg * np.sqrt(3.0))  # uniform, of that sigma
     mount = replace(
         options.mount, boresight_deg=(0.0, 0.0, 0.0), boresight_spread_deg=spread, gps_position_m=(0.1, 0.0, 0.3)
     )
