@@ -7,10 +7,11 @@ from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
+import pyproj
 
-from flightlog.errors import CaptureError
 from groundproc.cloud.nodes import Key, octree_of
 from groundproc.cloud.reader import look
+from groundproc.cloud.sameness import agreed_crs
 from groundproc.viewer.readers import Readers
 from groundproc.viewer.scene import origin_of, scene
 from groundproc.viewer.shades import TIME, shades_of
@@ -45,7 +46,9 @@ class Served:
     Raises
     ------
     CaptureError
-        One cannot be read, or they lie in several CRSs.
+        One cannot be read.
+    GeodesyError
+        They lie in several CRSs, or in angles.
     """
 
     def __init__(
@@ -53,17 +56,12 @@ class Served:
     ) -> None:
         everything = [*files] if overview is None else [*files, overview]
         self._clouds = [look(path) for path in everything]
-        for cloud in self._clouds:
-            if cloud.crs != self._clouds[0].crs:
-                raise CaptureError(
-                    f"{of}: {cloud.path} lies in {cloud.crs and cloud.crs.name} and {files[0]} in "
-                    f"{self._clouds[0].crs and self._clouds[0].crs.name}, expected one CRS; `swath transform` makes it so"
-                )
+        crs = agreed_crs(self._clouds)
         self._octrees = [octree_of(path) for path in everything]
         self._readers = Readers(list(zip(self._clouds, self._octrees, strict=True)))
         self._timed = all(cloud.timed for cloud in self._clouds) and len({each.week_time for each in self._clouds}) == 1
         try:
-            self._describe(of, paths, len(files))
+            self._describe(of, paths, len(files), crs)
         except BaseException:
             self._readers.close()
             raise
@@ -74,7 +72,7 @@ class Served:
     def __exit__(self, *_: object) -> None:
         self._readers.close()
 
-    def _describe(self, of: Path, paths: Sequence[Array], files: int) -> None:
+    def _describe(self, of: Path, paths: Sequence[Array], files: int, crs: pyproj.CRS | None) -> None:
         """Look at some points, and say what there is."""
         overview = files < len(self._octrees)
         looked = [files] if overview else np.unique(np.linspace(0, files - 1, _SAMPLED).astype(int)).tolist()
@@ -101,7 +99,7 @@ class Served:
         # single precision counts from where the points are, not from the middle to one that lies astray
         self.origin_m = origin_of(*np.percentile(xyz, _BULK, axis=0))
         spacing_m = min(octree.spacing_m for octree in self._octrees)
-        told = scene(self.origin_m, (low, high), xyz, self.shades, paths, spacing_m, self._clouds[0].crs)
+        told = scene(self.origin_m, (low, high), xyz, self.shades, paths, spacing_m, crs)
         self.scene: dict[str, Any] = told | {
             "name": of.name,
             "total": sum(cloud.points for cloud in self._clouds[:files]),

@@ -20,6 +20,7 @@ import pytest
 from browser import PROGRAM, Page, browser
 
 from groundproc.cli import main
+from groundproc.cloud import exports, reader
 from groundproc.cloud.points import Points
 from groundproc.cloud.writer import CloudWriter
 from groundproc.geodesy import projected_crs
@@ -371,6 +372,16 @@ def test_loops_that_were_not_saved_are_said(tab: Page, clouds: Clouds, tmp_path:
     assert not (tmp_path / "x.laz").exists()
 
 
+def copc_of_zone_34(folder: Path) -> Path:
+    """A COPC in another zone."""
+    points = ground(100)
+    plain, octree = folder / "east.laz", folder / "east.copc.laz"
+    with CloudWriter(plain, points.columns, crs=projected_crs(32634), offset_m=(533_000.0, 6_472_000.0, 0.0)) as writer:
+        writer.write(points)
+    exports.write(reader.look(plain), octree, octree, lambda done: None)
+    return octree
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -381,6 +392,7 @@ def test_loops_that_were_not_saved_are_said(tab: Page, clouds: Clouds, tmp_path:
         (["{folder}/gone.vpc"], "gone.vpc: lists ./gone.laz, and there is no such file; expected the tiles beside"),
         (["{folder}/far.vpc"], "far.vpc: lists https://example.org/a.copc.laz, expected files of this machine"),
         (["{folder}/plain.vpc"], "degrees.laz: a tile without an index, expected COPC; `swath tile"),
+        (["{folder}/zones.vpc"], "coordinates in WGS 84 / UTM zone 33N, but"),
         (["{folder}/far.vpc", "--edited", "{folder}/x.laz"], "classes are changed in one file, and"),
         (["{folder}/none.laz"], "no such file"),
         (["{folder}/degrees.laz"], "degrees.laz: coordinates in WGS 84 are angles, expected a projected CRS"),
@@ -400,6 +412,9 @@ def test_what_cannot_be_viewed_is_one_sentence(
     for name, href in (("gone", "./gone.laz"), ("far", "https://example.org/a.copc.laz"), ("plain", "degrees.laz")):
         items = {"type": "FeatureCollection", "features": [{"assets": {"data": {"href": href}}}]}
         (tmp_path / f"{name}.vpc").write_text(json.dumps(items))
+    other = copc_of_zone_34(tmp_path)
+    items = [{"assets": {"data": {"href": str(each)}}} for each in (other, clouds(3_000)[1])]
+    (tmp_path / "zones.vpc").write_text(json.dumps({"type": "FeatureCollection", "features": items}))
     told = [word.format(folder=tmp_path, cloud=clouds(3_000)[0]) for word in words]
     assert main(["view", *told]) in (1, 2)
     error = capsys.readouterr().err
